@@ -1,4 +1,4 @@
-/* The closed-loop kernel of fdhil/model/kernels.py, line by line but step by step, for comparison under -O3. */
+/* The closed-loop kernel of fdhil/model/closed_loop_kernels.py, line by line but step by step, for comparison under -O3. */
 #include <math.h>
 #include <stddef.h>
 

@@ -89,7 +89,8 @@ def main() -> None:
     targets = list(range(0, 10 * own.depth, 10))
     turns = 20_000
     print(
-        f"one axis' law in the guard: {timeit.timeit(lambda: own.compute_offsets(targets), number=turns) / turns * 1e6:.0f} us"
+        f"one axis' law in the guard: "
+        f"{timeit.timeit(lambda: own.compute_offsets(targets), number=turns) / turns * 1e6:.0f} us"
     )
 
 

@@ -148,7 +148,8 @@ def guard_reference() -> str:
     lines = [
         "# The guard's states and interlocks",
         "",
-        "Generated from `fdhil/guard/state_transitions.py` and `fdhil/guard/interlocks.py`, the tables that the guard itself",
+        "Generated from `fdhil/guard/state_transitions.py` and `fdhil/guard/interlocks.py`, the tables that the guard "
+        "itself",
         "goes by: no other way leads from one state to another. [Safety](../explanation/safety.md) says why.",
         *_states("States", SENT, TRANSITIONS),
         *_states("States of the on-line feed-forward", FEED_SENT, FEED_TRANSITIONS),

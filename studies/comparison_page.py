@@ -37,8 +37,8 @@ class Figures:
     """What came out for one noise and period: per cent of the truth, by method for each low-pass.
 
     ``rms`` and ``bias`` (filters, methods, 6); ``rejected`` (filters, methods, 6) is the share of single rapids on
-    which the Durbin-Wu-Hausman test against maximum likelihood rejects at 5 %; ``check_both_directions`` (2, 6) are RMS error and
-    bias of zero forcing #1 with the voltage left raw; ``bound`` (6,).
+    which the Durbin-Wu-Hausman test against maximum likelihood rejects at 5 %; ``check_both_directions`` (2, 6) are RMS
+    error and bias of zero forcing #1 with the voltage left raw; ``bound`` (6,).
     """
 
     noise: float
@@ -96,7 +96,8 @@ def _find_best_operator(found: Sequence[Figures], names: Names) -> list[str]:
     )
     lines += wrap_paragraph(
         f"""With {filters[USUAL]} the second best is {np.median(ordered[:, 1] / ordered[:, 0]):.2f} times as far off as
-        the best (median). There the largest bias of R is {join_words(shifts)} %, in the order of the table: zero forcing #1
+        the best (median). There the largest bias of R is {join_words(shifts)} %, in the order of the table: zero
+        forcing #1
         and central are accurate to second order, zero forcing with 3 taps and backward to first order. Without a
         low-pass the largest bias of Jt is {join_words(raw)} %: {usable or "none"} of the four can do without one (stay
         below {USABLE:g} %)."""
@@ -155,8 +156,12 @@ def _describe_moments(found: Sequence[Figures], names: Names) -> list[str]:
     worst = _find_largest_bias(found, USUAL, (ls, pm), parameters.index("Jt"))
     lines = ["## Does least squares beat the reinitialised partial moments?", ""]
     lines += wrap_paragraph(
-        f"""With {filters[USUAL]} it does {format_share(int(together[USUAL]), len(found))} cases over all six parameters; in most
-        cases for {join_words(better, "no parameter")}, not for {join_words([p for p in parameters if p not in better])}. There
+        f"""With {filters[USUAL]} it does {
+            format_share(int(together[USUAL]), len(found))
+        } cases over all six parameters; in most
+        cases for {join_words(better, "no parameter")}, not for {
+            join_words([p for p in parameters if p not in better])
+        }. There
         the largest bias of Jt is {worst[0]} % by least squares and {worst[1]} % by the moments. Without a low-pass it
         does {format_share(int(together[RAW]), len(found))} cases: the moments bring one of their own, their horizon."""
     )
@@ -211,8 +216,11 @@ def _describe_hausman_test(found: Sequence[Figures], names: Names) -> list[str]:
     lines = ["## Durbin-Wu-Hausman test against maximum likelihood", ""]
     lines += wrap_paragraph(
         f"""Maximum likelihood is consistent, so an estimate that differs from it by more than chance is biased. The
-        test at 5 % tells 5 % of the rapids for a method without bias. {_describe_rejections("zero_forcing_1", found, names)}.
-        {_describe_rejections("instrumental_variables", found, names)}: its instruments follow the NC's demand and know nothing of
+        test at 5 % tells 5 % of the rapids for a method without bias. {
+            _describe_rejections("zero_forcing_1", found, names)
+        }.
+        {_describe_rejections("instrumental_variables", found, names)}: its instruments follow the NC's demand and know
+        nothing of
         the sensors. {_describe_instrument_cost(found, names)}"""
     )
     columns = ["low-pass", "period ms", "noise %", *(SHORT[n] for n in shown)]

@@ -56,7 +56,8 @@ def _describe_day(figures: Figures) -> list[str]:
             f"""All figures below are for a machine with {len(AXES)} axes that makes a rapid (G0) a minute with each of
             them, around the clock: {A_DAY * len(AXES)} rapids in a day. Of each rapid there are {EACH_RAPID} records:
             what was found in its window, the parameter set that follows from it, and how well it was predicted; of one
-            rapid in {EACH_NOTICE} a notice in its place. That is {_describe_day_rate():,} records in a day, and a busy machine. A
+            rapid in {EACH_NOTICE} a notice in its place. That is {_describe_day_rate():,} records in a day, and a busy
+            machine. A
             machine that makes a tenth of the rapids has a tenth of all that follows."""
         ),
         *pages.write_table(["kind", "records (of the day that was sent)", "bytes of one, on the wire"], rows),

@@ -147,7 +147,8 @@ def describe_results(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Ki
     silent = sum(entry.accepted if entry.silent is None else entry.silent for entry in bad)
     lines = wrap_paragraph(
         f"""Good: {fine.windows} windows of {fine.count} recordings, {fine.refused} windows refused
-        ({_format_percent(fine.refused, fine.windows)}; {_compute_upper_bound(fine.refused, fine.windows)}), {len(fine.wrong)} recordings
+        ({_format_percent(fine.refused, fine.windows)}; {_compute_upper_bound(fine.refused, fine.windows)}),
+        {len(fine.wrong)} recordings
         without a validated pool{_count_warned(fine)}. Reasons: {count_codes(fine.codes) or "none"}."""
     )
     if fine.left_open:
@@ -155,7 +156,8 @@ def describe_results(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Ki
         lines += wrap_paragraph(f"{fine.left_open.total()} windows are accepted with a null and its reason: {nulls}.")
     lines += wrap_paragraph(
         f"""Bad: {recordings} recordings, {accepted} accepted, {silent} of them without a warning, {harmful} to harm
-        ({_compute_upper_bound(harmful, recordings)}), {_format_percent(right, recordings)} named rightly. {_find_worst_kinds(counted, kinds)}"""
+        ({_compute_upper_bound(harmful, recordings)}), {_format_percent(right, recordings)} named rightly.
+        {_find_worst_kinds(counted, kinds)}"""
     )
     wrong = [f"{name} {', '.join(map(str, entry.wrong))}" for name, entry in counted.items() if entry.wrong]
     lines += wrap_paragraph(f"Judged wrongly, or without a warning, by seed: {'; '.join(wrong) or 'none'}.")

@@ -22,11 +22,21 @@ from studies.trial import NOTICED, UNCALLED, judge
 
 PACKAGE = "fdhil.guard"
 DECIDING = (
-    *("core", "transitions", "conditions", "interlocks", "limits", "plausibility", "adoption", "path", "tracking"),
-    *("feedforward", "feeding", "landing", "table", "state"),
+    *(
+        "guard_step",
+        "state_transitions",
+        "interlock_checks",
+        "interlocks",
+        "offset_limits",
+        "read_back_checks",
+        "offset_adoption",
+        "corrected_path",
+        "path_tracking",
+    ),
+    *("feedforward_law", "feedforward_step", "emergency_ramp", "correction_table", "guard_state"),
 )
 """What decides what leaves; the rest turns bytes into records, or shows them."""
-ELSEWHERE = ("test_size", "test_process", "test_twin", "test_attacks", "test_long_life")
+ELSEWHERE = ("test_guard_size", "test_guard_process", "test_simulated_drive", "test_attacks", "test_guard_memory")
 """Tests that measure the text or the memory, or run the guard as a process of its own, where no mistake is put."""
 KEPT = Path(__file__).with_name("mutants_kept.json")
 GOAL = 0.95

@@ -134,7 +134,8 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     )
     lines += ["## How well the parameters are known", ""]
     lines += pages.wrap_paragraph(
-        f"{figures['runs']} runs a row: one rapid of the bench, rows at 1 kHz. {_describe_sampling(figures['intervals'])}"
+        f"{figures['runs']} runs a row: one rapid of the bench, rows at 1 kHz. "
+        f"{_describe_sampling(figures['intervals'])}"
     )
     lines += pages.wrap_paragraph(
         """RMS error in % of the truth (the delay's in us); in brackets the share of 95 % intervals that hold the truth.

@@ -3,9 +3,6 @@
 Modules are imported on first use. The names in ``fdhil.__all__`` follow semantic versioning.
 """
 
-import lazy_loader
+from fdhil.lazy_exports import export_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = export_names(__name__, __file__)

@@ -1,8 +1,5 @@
 """Arming: checks a program, hands its table rows to the guard, and feeds more rows while the machine runs."""
 
-import lazy_loader
+from fdhil.lazy_exports import export_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = export_names(__name__, __file__)

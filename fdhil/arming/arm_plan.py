@@ -64,7 +64,8 @@ class ArmRequest:
 class ArmPlan:
     """A correction ready for the guard: its first rows, the stream of rows that passed or will pass, and the facts.
 
-    ``armed_gain_um`` is the gain predicted for the rows that were checked at arming, ``half_um`` half the 95 % interval of
+    ``armed_gain_um`` is the gain predicted for the rows that were checked at arming, ``half_um`` half the 95 % interval
+    of
     the residual error, and ``left_um`` the RMS error in held-out moves (None: unknown). ``first`` recomputes the first
     rows for the axes' actual standstill.
     """

@@ -95,7 +95,8 @@ def _show_range(one: Range, most: Mapping[float, FeedAdvice] | None) -> None:
     fast = worst.corrected if worst.corrected and worst.corrected.share is not None else None
     better = "" if fast is None else f", with the correction F{cut_to_digits(fast.run * worst.feed_mm_min):g}"
     click.echo(
-        f"{name}: F{_format_feed_span([a.feed_mm_min for a in one])} -> F{_format_feed_span([cut_to_digits(a.plain.run * a.feed_mm_min) for a in one])}"
+        f"{name}: F{_format_feed_span([a.feed_mm_min for a in one])} -> "
+        f"F{_format_feed_span([cut_to_digits(a.plain.run * a.feed_mm_min) for a in one])}"
         f"{better}, worst {worst.error_um:.1f} um {at} ({worst.cause}, most of it axis {worst.axis})"
     )
     axis, what, share = max((a.load for a in one), key=lambda load: load[2])

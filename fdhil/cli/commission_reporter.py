@@ -66,7 +66,8 @@ class StepReporter:
         from fdhil.report import format_minute
 
         self._show_line(
-            f"{self._format_heading(name)}: skipped, done {format_minute(step.done_utc)}; {format_result(name, step.found)}"
+            f"{self._format_heading(name)}: skipped, done {format_minute(step.done_utc)}; "
+            f"{format_result(name, step.found)}"
         )
 
     def report_result(self, step: str, found: Found) -> None:

@@ -110,7 +110,7 @@ def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
 
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet import run_query as _  # noqa: F401 - a missing library is reported before the start
+        from fdhil.fleet import QUERIES as _  # noqa: F401, N811 - a missing library is reported before the start
     from fdhil.web import require_extra, serve_application
 
     require_extra()

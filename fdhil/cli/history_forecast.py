@@ -249,7 +249,8 @@ def predict_crossings(
 ) -> list[dict[str, Any]]:
     """Return as JSON when each zone will leave the tolerance.
 
-    ``state`` is over, foreseen, not_foreseen (within ``within_days``) or not_enough_history (of ``compute_observed_days``).
+    ``state`` is over, foreseen, not_foreseen (within ``within_days``) or not_enough_history (of
+    ``compute_observed_days``).
     """
     from fdhil.identification import limit_forecast_days
     from fdhil.prediction import error_forecast

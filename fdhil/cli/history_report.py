@@ -96,7 +96,8 @@ def _build_axis_section(history: AxisHistory, refused: Refusals) -> Section:
         > MOST_SINGLE_ESTIMATES
     )
     shown = "" if not many else (
-        f"With more than {MOST_SINGLE_ESTIMATES} rapids the plots show the median of each day, and a band from the {DAY_PERCENTILES[0]:.0f}th to "
+        f"With more than {MOST_SINGLE_ESTIMATES} rapids the plots show the median of each day, and a band from the "
+        f"{DAY_PERCENTILES[0]:.0f}th to "
         f"the {DAY_PERCENTILES[1]:.0f}th percentile."
     )  # fmt: skip
     tables = [

@@ -1,6 +1,7 @@
 """Generate the set-points of a machine, one row per SYNC, and keep every row inside its bounds. Pure.
 
-All set-points come from :meth:`SetPointGenerator.step` alone. A row is sent only if the axes can still be braked inside their
+All set-points come from :meth:`SetPointGenerator.step` alone. A row is sent only if the axes can still be braked inside
+their
 travel from there: a stop is always possible, and always the same. It continues straight ahead from the last two rows
 sent, each axis' speed falling to zero in the same n cycles, n = ceil(max |v|/a).
 """

@@ -41,8 +41,8 @@ def build_steps_path(directory: Path, axis: str) -> Path:
 class StepProgress:
     """The completed steps of one axis; each is written as soon as it is done.
 
-    ``doubt`` says why an existing file was rejected. ``on_reused`` is called for each reused step. StoreError if the file
-    or the key exists but cannot be read.
+    ``doubt`` says why an existing file was rejected. ``on_reused`` is called for each reused step. StoreError if the
+    file or the key exists but cannot be read.
     """
 
     def __init__(self, directory: Path, axis: str, key: Path | None = None) -> None:

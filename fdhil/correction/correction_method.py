@@ -14,7 +14,8 @@ from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
 class MethodPlan:
     """A method's result: ``offset_um`` (n,) per axis, within the limits and in whole increments.
 
-    ``measure_delay_s`` is the common delay tau that the method aims at, r(t - tau). ``refused`` are the method's own refusals.
+    ``measure_delay_s`` is the common delay tau that the method aims at, r(t - tau). ``refused`` are the method's own
+    refusals.
     ``untouched``: the offset is sent unchanged, or not at all (mirror). The speed and torque offsets (0x60B1, 0x60B2)
     are empty except for an on-line feed-forward.
     """

@@ -1,8 +1,5 @@
 """The service: sources in, pipelines in worker threads, outcomes to the store and to whoever asks."""
 
-import lazy_loader
+from fdhil.lazy_exports import export_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = export_names(__name__, __file__)

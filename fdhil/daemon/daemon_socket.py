@@ -3,9 +3,10 @@
 A request is {"request": "status" | "live" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or {"ok":
 false, "code", "text", "advice"}. With "progress": true, lines {"progress": {...}} precede an answer that takes time;
 closing the connection meanwhile abandons the check of an arm request. The kernel identifies the client, and the config
-assigns its rights (``peers``); arming also needs the operator's token. After the answer to ``live`` the connection
-streams samples (``fdhil.daemon.live_stream``). When all sixteen connections are in use, the longest idle one makes room; where
-all wait for answers, four more clients may send ``status`` and ``disarm``.
+assigns its rights (``daemon_access``); arming also needs the operator's token. After the answer to ``live`` the
+connection
+streams samples (``fdhil.daemon.live_stream``). When all sixteen connections are in use, the longest idle one makes
+room; where all wait for answers, four more clients may send ``status`` and ``disarm``.
 """
 
 import asyncio

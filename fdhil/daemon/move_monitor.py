@@ -131,7 +131,8 @@ class MoveMonitor:
             return "ScaleSuspect", f"{text}; correct increments_per_rev, the drive's profile or its sign"
         if self.seen >= FEW and fastest > TOO_FAST * self._rapid_mm_s:
             return "PitchSuspect", (
-                f"moves reach {self._axis.format_in_unit(fastest, '/s')}, {fastest / self._rapid_mm_s:.2f} times the rapid"
+                f"moves reach {self._axis.format_in_unit(fastest, '/s')}, {fastest / self._rapid_mm_s:.2f} times the "
+                f"rapid"
                 f" speed of the config; correct {pitch}, increments_per_rev or {rapid}"
             )
         if self.seen < FEW or windows:
@@ -144,7 +145,8 @@ class MoveMonitor:
             return "MovesNotUsed", (
                 f"{self.seen} moves recorded, none used: {self.slow} stay below {self._needed:.0%} of the rapid speed"
                 f" of {self._axis.format_in_unit(self._rapid_mm_s, '/s', 'g')}, the fastest at"
-                f" {self._axis.format_in_unit(self.fastest_mm_s, '/s')}; run rapids at full override, or correct {rapid} or"
+                f" {self._axis.format_in_unit(self.fastest_mm_s, '/s')}; run rapids at full override, or correct "
+                f"{rapid} or"
                 f" {pitch}"
             )
         if self.usable >= FEW and now_s - self.usable_s > PATIENCE_S:

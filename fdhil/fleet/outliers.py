@@ -1,8 +1,8 @@
 """Finds axes that deviate from comparable axes: the same axis of machines of one kind, at one temperature and age.
 
 The level of an axis is the median of its newest values of a parameter, relative to the median of its peers. A mixed
-model (:mod:`fdhil.fleet.mixed_model`) accounts for temperature and age and estimates the remaining spread; the axis' own
-uncertainty, and that of an unknown temperature, are added. The bounds give a false alarm in one of a hundred groups
+model (:mod:`fdhil.fleet.mixed_model`) accounts for temperature and age and estimates the remaining spread; the axis'
+own uncertainty, and that of an unknown temperature, are added. The bounds give a false alarm in one of a hundred groups
 without an outlier, whatever their size (found by simulation).
 """
 
@@ -27,8 +27,8 @@ BOUNDS = (
 class ParameterHistory:
     """The newest values of one parameter of an axis, oldest first, with temperatures (NaN where unknown), all (n,).
 
-    ``compute_ages_months`` (n,) count from the first set, or from the newest service. ``std`` is the standard deviation of the
-    newest value.
+    ``compute_ages_months`` (n,) count from the first set, or from the newest service. ``std`` is the standard deviation
+    of the newest value.
     """
 
     machine: str

@@ -37,7 +37,8 @@ def _select_json_type_sql(value: LiteralString, kind: LiteralString, empty: Lite
 _MOVED: LiteralString = (
     f""", each AS MATERIALIZED (
   SELECT label, axis, b.key AS parameter, {_cast_number_sql("b.value->'value'")} AS before,
-    {_cast_number_sql("parameters->b.key->'value'")} AS now, {_cast_number_sql("parameters->b.key->'std'")} * %(interval)s AS half
+    {_cast_number_sql("parameters->b.key->'value'")} AS now, {_cast_number_sql("parameters->b.key->'std'")} *
+    %(interval)s AS half
   FROM of, jsonb_each({_select_json_type_sql("parameters_before", "object", "{}")}) b
   WHERE accepted AND accepted_before),
 moved AS (SELECT *, now - before AS by FROM each)

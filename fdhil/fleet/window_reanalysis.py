@@ -79,7 +79,7 @@ def compute_code_digest() -> str:
 def _list_sources(folder: Path) -> Iterator[Path]:
     for room in ROOMS:
         yield from sorted((folder / room).rglob("*.py"))
-    yield folder / "store" / "windows.py"
+    yield folder / "store" / "window_file.py"
 
 
 def reanalyse_batch(windows: Sequence[WindowReference], method: AnalysisMethod) -> list[ReanalysedWindow]:

@@ -99,7 +99,7 @@ class _NodeState:
 
 
 class FrameMonitor:
-    """Gathers frames (``take``) and returns the axes' inputs and the bus state at a SYNC (``at_sync``).
+    """Gathers frames (``take_frame``) and returns the axes' inputs and the bus state at a SYNC (``close_sync_cycle``).
 
     The bus does not return what we send ourselves: a frame with one of our COB-IDs comes from another node.
     """

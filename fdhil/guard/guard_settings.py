@@ -60,7 +60,8 @@ class AxisSettings:
     and bounded by the axis' ``max_speed_mm_s`` and ``max_acceleration_mm_s2``, too. ``speed_count`` is one count of
     0x606C in increments per SYNC cycle, ``speed_step`` the largest change of the motor's speed in one cycle in that
     unit; 0: not checked. ``travel`` are the drive's software limits (0x607D), None: it has none.
-    ``compute_heartbeat_timeout_s`` 0: the drive has no heartbeat, only its PDOs show that it is Operational. ``writers`` are
+    ``compute_heartbeat_timeout_s`` 0: the drive has no heartbeat, only its PDOs show that it is Operational.
+    ``writers`` are
     foreign COB-IDs whose frames may change an offset of the drive. ``record`` is the fingerprint of the commissioned
     drive, empty: not commissioned; ``record_void``: an event since then voids it, ``read_void_reason`` names the event.
     """
@@ -162,7 +163,7 @@ def encode_settings(settings: GuardSettings) -> str:
 
 
 def decode_settings(text: str, source: str = "settings") -> GuardSettings:
-    """Parse settings; ConfigError when the text is not what ``to_json`` writes, or exceeds a ceiling."""
+    """Parse settings; ConfigError when the text is not what ``encode_settings`` writes, or exceeds a ceiling."""
     try:
         document = json.loads(text, parse_constant=refuse_constant)
         if document.pop("schema") != SCHEMA:

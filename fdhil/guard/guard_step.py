@@ -1,4 +1,4 @@
-"""Decides what leaves the guard: ``step(state, inputs, settings) -> (state, output)``, pure, once per SYNC.
+"""Decides what leaves the guard: ``step_guard(state, inputs, settings) -> (state, output)``, pure, once per SYNC.
 
 No clock, no I/O: time is the SYNC count in the state. Every way out of a state leads toward OFF, except the operator's
 arm and adopt. The order within a step: what the drives and the bus show, the interlocks, the request, the position on

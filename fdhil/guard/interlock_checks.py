@@ -97,7 +97,7 @@ def list_failing_interlocks(bus: BusView, views: Views) -> Alarms:
 
 
 def list_arming_obstacles(views: Views) -> Alarms:
-    """Return an alarm for every condition of the drives, beyond ``failing``, that forbids arming."""
+    """Return an alarm for every condition of the drives, beyond ``list_failing_interlocks``, that forbids arming."""
     return tuple([_make_arming_alarm(code, v) for v in views for code, good in ARMING_INTERLOCKS if not good(*v)])
 
 

@@ -1,7 +1,7 @@
 """Limits an offset, in whole drive increments per SYNC cycle, and moves it within these limits.
 
 All of it is integer arithmetic: no NaN, no rounding, and a test can enumerate every start. The check of a frame
-(``violation``) shares no formula with the motion (``follow``), so that each guards the other.
+(``find_limit_violation``) shares no formula with the motion (``move_toward_goal``), so that each guards the other.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def compute_stopping_distance(rate: int, acceleration: int) -> int:
 
 
 def compute_approach_rate(distance: int, acceleration: int) -> int:
-    """Return the largest rate u with u + stopping(u) <= ``distance`` >= 0: the fastest move that still stops there."""
+    """Return the largest rate u with u + its stopping distance <= ``distance`` >= 0: the fastest move that still stops there."""
     steps = (isqrt(8 * distance // acceleration + 1) + 1) // 2
     return (distance + acceleration * steps * (steps - 1) // 2) // steps
 

@@ -30,7 +30,7 @@ class BusAddress(Protocol):
 
 
 def open_transmit_socket(name: str, bus: BusAddress) -> socket.socket:
-    """Open the transmit descriptor; a hub needs ``greet`` after it. ConnectError when the bus is unavailable."""
+    """Open the transmit descriptor; a hub needs ``greet_hub`` after it. ConnectError when the bus is unavailable."""
     if bus.interface == "socketcan":
         return _open_can_raw(name, bus.channel)
     if bus.interface == "socketcand":

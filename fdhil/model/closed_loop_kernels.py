@@ -26,7 +26,8 @@ POSITION_KI, ACCELERATION, DECAY, RAD_PER_MM, SPEED_CYCLES_PER_S, SPEED_DECAY, F
 # LinuxCNC's pid: gains of its terms, output limit (0: none), error-previous-target and speed loop as 0 or 1
 DERIVATIVE, FF0, FF2, FF3, DEADBAND_MM, OUTPUT_MAX, PREVIOUS_TARGET, SPEED_LOOP = range(17, 25)
 GAINS = 25
-# indices of the terms, see fdhil.model.model_terms.pack_terms; then periods per turn, amplitude and phase of each ripple
+# indices of the terms, see fdhil.model.model_terms.pack_terms; then periods per turn, amplitude and phase of each
+# ripple
 LOAD, DRY_POSITIVE, DRY_NEGATIVE, VISCOUS, VISCOUS_POSITIVE, VISCOUS_NEGATIVE, STRIBECK, STRIBECK_SPEED = range(8)
 DEAD_TIME, SPRING, DAMPER, PRESLIDING, RIPPLES = range(8, 13)
 STRIBECK_REACH = 6.0  # times its speed; beyond it the Stribeck part is below the last bit of the friction
@@ -34,7 +35,8 @@ STRIBECK_REACH = 6.0  # times its speed; beyond it the Stribeck part is below th
 CASCADE, PID, LINUXCNC = range(3)
 # further memory of LinuxCNC's pid, in elements of the set-point filter that it does not have
 COMMAND_SPEED, COMMAND_ACCELERATION, OUTPUT, OUTPUT_LIMITED = 10, 11, 13, 14
-# rows of the map over a speed cycle, see fdhil.model.multi_cycle_step, for a moving and for a held table, with its bounds
+# rows of the map over a speed cycle, see fdhil.model.multi_cycle_step, for a moving and for a held table, with its
+# bounds
 LEAP_CURRENT, LEAP_SPEED, LEAP_INTEGRAL, LEAP_WAY, LEAP_TURN, LEAP_VOLTAGE = range(6)
 HELD_CURRENT, HELD_INTEGRAL, HELD_BREAK, HELD_VOLTAGE, LEAP_RESISTANCE = range(6, 11)
 LEAP_ROWS, LEAP_COLUMNS = 11, 5
@@ -488,8 +490,10 @@ def run_sync_cycles(
     """Run SYNC cycles ``first`` .. ``first + rows - 1``; return (1 + kept, rows), sampled at the start of each cycle.
 
     ``reference`` (n,) mm is held beyond its end; ``speed_offset`` rad/s and ``current_offset`` A are (n,) or empty.
-    ``plant`` (16,), ``leap`` (LEAP_ROWS, LEAP_COLUMNS) or empty, and ``gains`` (GAINS,): see :mod:`fdhil.model.closed_loop_drive`.
-    ``terms``, None for a plain drive, and ``masses``: see :mod:`fdhil.model.model_terms`. ``shape``: law, states recorded per
+    ``plant`` (16,), ``leap`` (LEAP_ROWS, LEAP_COLUMNS) or empty, and ``gains`` (GAINS,): see
+    :mod:`fdhil.model.closed_loop_drive`.
+    ``terms``, None for a plain drive, and ``masses``: see :mod:`fdhil.model.model_terms`. ``shape``: law, states
+    recorded per
     cycle, speed cycles per SYNC cycle, current cycles per speed cycle, order of the set-point filter, current cycles of
     delay. ``state`` (STATES,) is written.
     """

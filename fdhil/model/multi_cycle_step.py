@@ -48,7 +48,8 @@ def _compute_cycle_map(plant: tuple[float, ...], kp: float, ki: float, steps: in
 def compute_cycle_map(plant: Float, kp: float, ki: float, steps: int) -> Float:
     """Return the kernel's (LEAP_ROWS, LEAP_COLUMNS) for ``steps`` current-loop steps with gains ``kp`` V/A, ``ki`` V/A.
 
-    ``plant`` (16,) is the exact step of :func:`fdhil.model.closed_loop_drive.compute_plant_step`. Maps act on current, speed, integral,
+    ``plant`` (16,) is the exact step of :func:`fdhil.model.closed_loop_drive.compute_plant_step`. Maps act on current,
+    speed, integral,
     demand and the sign of the friction. Bounds act on |current|, |speed|, |demand - current|, |integral - R i - K w|,
     1. The first coefficient of the speed-change bound acts on the current less the share taken by dry friction.
     """

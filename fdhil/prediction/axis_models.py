@@ -43,8 +43,8 @@ Loops = Mapping[str, Mapping[str, float | str]]
 class ModelFile(NamedTuple):
     """The contents of a model file by axis; an axis without a table of loops has none in ``loops``.
 
-    ``held_out_um`` is the model's RMS residual, um, of moves that it was not identified on, and ``find_held_out_max_um`` the
-    largest error in any of them, where they are given.
+    ``held_out_um`` is the model's RMS residual, um, of moves that it was not identified on, and
+    ``find_held_out_max_um`` the largest error in any of them, where they are given.
     """
 
     parameters: dict[str, Parameters]

@@ -151,8 +151,8 @@ def compare_zones(
 ) -> tuple[ZoneChange, ...]:
     """Return the change of each zone since ``earlier`` parameters were used, including zones that are gone.
 
-    ``compute_std_um`` (n,) is that of the present prediction; ``recorded`` are the zones as reported then, each with its
-    standard deviation: if the configuration has changed since, they show its effect.
+    ``compute_std_um`` (n,) is that of the present prediction; ``recorded`` are the zones as reported then, each with
+    its standard deviation: if the configuration has changed since, they show its effect.
     """
     reference = prediction.reference
     then = predict_path(reference, {**models, **earlier}, config)

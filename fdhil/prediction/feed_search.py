@@ -46,8 +46,8 @@ Span = tuple[float, float]
 class FeedScaledPath:
     """A path that can be generated with every segment at its own share of the feed (default 1).
 
-    The ``line`` of its references is the segment of a row, 0 for a rest; ``line`` and ``compute_feed_mm_min`` give the user's
-    line and feed of a segment. Errors up to ``after_s`` behind a segment are its own.
+    The ``line`` of its references is the segment of a row, 0 for a rest; ``line`` and ``compute_feed_mm_min`` give the
+    user's line and feed of a segment. Errors up to ``after_s`` behind a segment are its own.
     """
 
     at: Callable[[Mapping[int, float]], Trajectory]

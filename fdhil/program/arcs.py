@@ -100,7 +100,8 @@ def _check_radii(block: Block, modal: ModalState, begin_mm: float, finish_mm: fl
     if begin_mm < _MIN_RADIUS_MM or finish_mm < _MIN_RADIUS_MM:
         raise block.build_error(word, "the arc has no radius; move the centre away from start and end")
     if not is_radius_difference_allowed(begin_mm, finish_mm, modal.scale):
-        raise block.build_error(word, f"the radius is {begin_mm:.4f} mm at the start and {finish_mm:.4f} mm at the end of "
+        raise block.build_error(word, f"the radius is {begin_mm:.4f} mm at the start and {finish_mm:.4f} mm at the "
+                                      f"end of "
                                 f"the arc; correct centre or end ({axes})")  # fmt: skip
 
 

@@ -136,8 +136,8 @@ class Correction:
     """Result of a correction method for a reference: offsets per axis (n,), path error without and with them.
 
     ``offset_um`` is added to the reference; ``refused`` is empty when the correction may be used, else all offsets are
-    0. ``warnings`` do not refuse it. ``measure_delay_s`` is the delay tau of the target r(t - tau). Speed and torque offsets
-    (n,) per axis are empty unless the method is an on-line feed-forward.
+    0. ``warnings`` do not refuse it. ``measure_delay_s`` is the delay tau of the target r(t - tau). Speed and torque
+    offsets (n,) per axis are empty unless the method is an on-line feed-forward.
     """
 
     method: str

@@ -90,7 +90,8 @@ class Parameters:
         load + side (C + stribeck exp(-(w / stribeck_speed)^2)) + f w + sum of ripple_k sin(k a + ripple_k_phase)
 
     C is ``coulomb_positive`` or ``coulomb_negative`` where these exist, else Cd; f likewise ``viscous_...`` or ft. The
-    shaft sticks while |K i - load - ripples| <= C + stribeck. ``terms`` are pairs of name and value. ``build_dead_time_regressor`` is
+    shaft sticks while |K i - load - ripples| <= C + stribeck. ``terms`` are pairs of name and value.
+    ``build_dead_time_regressor`` is
     the voltage that the inverter loses, against the current's direction. ``resonance`` is that of motor and table
     against each other, the motor free, from motor torque to motor speed; the table has ``resonance_share`` of Jt
     (default: half), and the friction acts on the table.

@@ -17,8 +17,8 @@ class AxisSamples:
 
     ``tick`` counts SYNC cycles and increases strictly; a hole in it is a lost sample, and ``lost`` counts the frames
     lost while the block was gathered. ``demand_mm`` is r[k], the set-point that the drive follows at that tick, without
-    offset. ``offset_mm`` is the position offset (0x60B0) in force. ``compute_motor_voltage_v`` is None when no drive object provides
-    it.
+    offset. ``offset_mm`` is the position offset (0x60B0) in force. ``compute_motor_voltage_v`` is None when no drive
+    object provides it.
     """
 
     axis: str
@@ -56,8 +56,8 @@ class SlowVoltage:
     """Voltage of a sensor slower than the drive, on its own grid: ``compute_motor_voltage_v`` (m,), lost samples NaN.
 
     Sample j covers one period from ``begin_s`` + j ``period_s`` after sample 0 of the window (or is the value at its
-    start, by the window's ``voltage_sampling``). ``error_s`` is the uncertainty of ``begin_s``. ``estimate_current_lag_s`` (m,), for a
-    polled sensor, is the delay of each value, less than half a period.
+    start, by the window's ``voltage_sampling``). ``error_s`` is the uncertainty of ``begin_s``.
+    ``estimate_current_lag_s`` (m,), for a polled sensor, is the delay of each value, less than half a period.
     """
 
     begin_s: float
@@ -153,7 +153,8 @@ class Window:
     """One G0 of one axis on a uniform grid of ``dt_s``, from rest to rest, with its stages and gaps.
 
     Arrays are (n,); a lost sample is NaN in every signal, and ``gaps`` lists the half-open ranges that were lost.
-    ``compute_motor_voltage_v`` of sample k is the mean over [t_k, t_k + dt) when ``voltage_sampling`` is ``interval_mean``, else the
+    ``compute_motor_voltage_v`` of sample k is the mean over [t_k, t_k + dt) when ``voltage_sampling`` is
+    ``interval_mean``, else the
     value at t_k; ``voltage_delay_s`` (the residual delay after alignment by counters, None when unknown) is not
     compensated. ``slow_voltage`` replaces it where a sensor samples more slowly than the drive. ``speed_late_s`` is the
     delay of the recorded speed, already compensated (None: no compensation), with its standard deviation. ``table_mm``
@@ -205,8 +206,8 @@ class Window:
 class Recording:
     """Samples of one axis before windows are cut, a whole file or the newest ones: arrays (n,), lost samples NaN.
 
-    ``gaps`` are half-open. ``slow_voltage``, counted from sample 0, replaces ``compute_motor_voltage_v`` where a sensor is slower;
-    both are None without a source. Sample 0 is at ``start_tick``. The rest is as in :class:`Window`.
+    ``gaps`` are half-open. ``slow_voltage``, counted from sample 0, replaces ``compute_motor_voltage_v`` where a sensor
+    is slower; both are None without a source. Sample 0 is at ``start_tick``. The rest is as in :class:`Window`.
     """
 
     axis: str

@@ -39,7 +39,8 @@ class Estimate:
     """Result of an estimator: ``values`` (k,) and ``covariance`` (k, k) of ``names``; NaN where not identifiable.
 
     ``residuals`` maps "electrical" (V) and "mechanical" (A) to their residuals (m,), in standard deviations where the
-    method is maximum likelihood. ``missing`` maps names that are NaN to the reason. ``measure_delay_s`` is the voltage delay
+    method is maximum likelihood. ``missing`` maps names that are NaN to the reason. ``measure_delay_s`` is the voltage
+    delay
     that the data show, None when not estimated, and ``delay_std_s`` its standard deviation. ``systematic`` (k, q) is
     the part of the covariance that all windows of a drive share, one standard deviation a column, None when
     unavailable. ``names`` are ``PARAMETERS``, then the added terms; ``given`` names were not estimated but taken from

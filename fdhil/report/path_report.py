@@ -57,7 +57,8 @@ def build_correction_page(
         verdict = _describe_predicted_gain(after, predicted)
     return Page(
         title=f"Correction of {name}",
-        subtitle=f"Planned for {machine} with the method {planned.method}{_describe_parameters(parameters)}; nothing was sent.",
+        subtitle=f"Planned for {machine} with the method {planned.method}{_describe_parameters(parameters)}; nothing "
+        f"was sent.",
         headline=[*_list_headline_figures("uncorrected, predicted", before), *verdict],
         sections=[
             *([Section("Why it was refused", reasons)] if reasons else []),

@@ -4,9 +4,6 @@ They are clients of the daemon's socket that only request its status. Nothing he
 nothing received from such a network reaches the daemon.
 """
 
-import lazy_loader
+from fdhil.lazy_exports import export_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = export_names(__name__, __file__)

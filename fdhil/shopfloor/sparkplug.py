@@ -66,8 +66,9 @@ class Message:
 class EdgeNode:
     """The session of one edge node with a broker, across connections.
 
-    The order of calls is that of the specification: ``will`` before each connection, ``births`` after it (and when a
-    host requests them), then ``news`` repeatedly, ``death`` before the connection is closed on purpose.
+    The order of calls is that of the specification: ``begin_connection`` before each connection, ``build_births`` after
+    it (and when a
+    host requests them), then ``build_changes`` repeatedly, ``build_death`` before the connection is closed on purpose.
     """
 
     def __init__(self, group: str, node: str) -> None:

@@ -283,7 +283,8 @@ def _check_distinct_columns(raw: RecordingTable, column_map: ColumnMap, source: 
         other = found.setdefault(id(raw.columns[column.name]), column.name)
         if other != column.name:
             raise RecordingError(
-                f"{source} has {quote_cell(other)} and {quote_cell(column.name)} above one column: its head lists one signal a "
+                f"{source} has {quote_cell(other)} and {quote_cell(column.name)} above one column: its head lists one "
+                f"signal a "
                 "line; name the columns #1, #2 ... from the left instead"
             )
 
@@ -295,7 +296,8 @@ def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -
     wrong = units and not any(math.isclose(known[unit], known[column.unit]) for unit in units)
     if wrong and "factor" not in column.model_fields_set and column.name not in raw.clocks:
         raise RecordingError(
-            f"{source} has {quote_cell(column.name)} in {units[0]}, the column map has {column.unit}: correct unit in the "
+            f"{source} has {quote_cell(column.name)} in {units[0]}, the column map has {column.unit}: correct unit in "
+            f"the "
             "map, or set factor = 1 if the file is wrong"
         )
 

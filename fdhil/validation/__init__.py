@@ -3,9 +3,6 @@
 No estimate is accepted unchecked. The checks never raise, whatever the signals; each refusal has a reason.
 """
 
-import lazy_loader
+from fdhil.lazy_exports import export_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = export_names(__name__, __file__)

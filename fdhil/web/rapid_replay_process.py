@@ -1,6 +1,7 @@
 """Replays recorded rapids for the pages: a child process at low priority, so that computing does not delay them.
 
-``python -m fdhil.web.rapid_replay_process``: the first line on stdin is the configuration, each further one requests a rapid,
+``python -m fdhil.web.rapid_replay_process``: the first line on stdin is the configuration, each further one requests a
+rapid,
 all as JSON. An answer is one line: a + and the signals, or a - and a fault. It only reads, and ends with its parent, or
 when idle for a while: its libraries take 200 MB.
 """

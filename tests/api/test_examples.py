@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MODULES = ("recordings", "result", "machine", "model")
+MODULES = ("recording_interface", "identification_result", "machine_interface", "drive_model")
 
 
 @pytest.mark.parametrize("name", MODULES)

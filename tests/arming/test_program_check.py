@@ -351,7 +351,7 @@ def test_result_of_other_code_is_checked_again(tmp_path: Path, monkeypatch: pyte
     shutil.copytree(Path(fdhil.__file__).parent, home, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(fdhil, "__file__", str(home / "__init__.py"))
     assert CheckedProgram.find_checked(tmp_path, "a", tmp_path) is not None
-    (home / "guard" / "core.py").write_text("")  # makes no row
+    (home / "guard" / "guard_step.py").write_text("")  # makes no row
     assert CheckedProgram.find_checked(tmp_path, "a", tmp_path) is not None
     with (home / "program" / "planner" / "smoothing.py").open("a") as file:
         file.write("# otherwise\n")

@@ -462,7 +462,7 @@ def test_help_states_what_is_sent(run_fdhil: Said, command: str) -> None:
 def running_nc(
     run_fdhil: Said, commissioning_bench: CommissioningBench, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[CommissioningBench]:
-    for module in ("scan", "config_check", "survey"):
+    for module in ("scan", "config_check", "drive_survey"):
         monkeypatch.setattr(f"fdhil.commissioning.{module}.LISTEN_S", LISTEN_S)
     commissioning_bench.twin.send_command("nc", on=True)
     assert commissioning_bench.twin.wait_for_event("nc")["on"]

@@ -242,7 +242,8 @@ WRONG: dict[str, tuple[Callable[[DriveBench], None], str, bool]] = {
     "window off": (set_object(0x6065, 0, 0xFFFFFFFF), "0x6065 is off: it never detects", False),
     "gear x 10": (set_object(0x6091, 1, 10), "it has 6553.6 position increments per motor revolution", False),
     "scale of the config": (
-        replace_config_text("node_id = 1\n", "node_id = 1\nincrements_per_rev = 16384\n"), "but the configuration has 16384", False),
+        replace_config_text("node_id = 1\n", "node_id = 1\nincrements_per_rev = 16384\n"), "but the configuration has "
+                                                                                           "16384", False),
     "rated current": (set_object(0x6075, 0, 10_000), "its rated current is 10 A (0x6075)", False),
     "mapping": (
         lambda b: b.peer.drive.overwrite_mapping(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),

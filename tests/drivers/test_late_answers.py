@@ -101,7 +101,7 @@ class SlowUnit:
     def monotonic_ns(self) -> int:
         return self.now_ns
 
-    def wire_ns(self, _count: int) -> int:
+    def compute_wire_ns(self, _count: int) -> int:
         return 0
 
     def send(self, _name: str, data: bytes) -> int:
@@ -114,14 +114,14 @@ class SlowUnit:
             self._coming.append(Chunk(frame, self._free_ns))
         return self.now_ns
 
-    async def receive(self, _name: str, until_ns: int) -> Chunk | None:
+    async def receive_chunk(self, _name: str, until_ns: int) -> Chunk | None:
         if self._coming and self._coming[0].t_ns <= until_ns:
             self.now_ns = max(self.now_ns, self._coming[0].t_ns)
             return self._coming.popleft()
         self.now_ns = max(self.now_ns, until_ns)
         return None
 
-    def discard(self) -> int:
+    def discard_input(self) -> int:
         came = sum(chunk.t_ns <= self.now_ns for chunk in self._coming)
         for _ in range(came):
             self._coming.popleft()

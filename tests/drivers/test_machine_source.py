@@ -112,7 +112,7 @@ class SensorFailingAtTheEnd:
         await asyncio.Event().wait()
         return []
 
-    async def poll(self, _: object) -> list[Record]:
+    async def poll_samples(self, _: object) -> list[Record]:
         async with self:
             return [*await self.read_states()]
 

@@ -107,7 +107,7 @@ async def test_swapped_bytes_and_rtu_framing_are_supported(kind: str, over_rtu: 
     voltage |= {"framing": "rtu", "unit": 3} if over_rtu else {"word_order": "little"}
     async with run_sensor_bench(voltage) as served:
         sensor = served.sensors()["voltage"]
-        assert type(sensor.link).__name__ == "ModbusLink"
+        assert type(sensor.link).__name__ == "ModbusUnit"
         np.testing.assert_allclose(await collect_voltages(sensor), -12.34, atol=TYPES[kind] if kind[0] != "f" else 1e-4)
 
 

@@ -1,6 +1,7 @@
 """Runs a guard whose timeouts a test can shorten: a file in its run directory stands for ten seconds of silence.
 
-``python -m tests.guard.short_timeouts CONFIG`` starts it as fdhil-guard does; with ``--settings`` it is the guard itself.
+``python -m tests.guard.short_timeouts CONFIG`` starts it as fdhil-guard does; with ``--settings`` it is the guard
+itself.
 """
 
 from __future__ import annotations

@@ -142,7 +142,7 @@ class _CheckInProcess(asyncio.SubprocessTransport):
         self._protocol.pipe_connection_lost(1, None)
         self._protocol.process_exited()
 
-    async def _wait_for_end(self) -> int:
+    async def _wait(self) -> int:
         await self._ended.wait()
         return self._code or 0
 

@@ -30,12 +30,12 @@ M2
 """.splitlines()
 
 
-@pytest.fixture(scope="module", name="reference")
+@pytest.fixture(scope="module")
 def three_axis_reference() -> Trajectory:
     return plan_program(interpret(PROGRAM, Budget.create_from_config(CONFIG.nc)), CONFIG)
 
 
-@pytest.fixture(scope="module", name="correction")
+@pytest.fixture(scope="module")
 def three_axis_correction(three_axis_reference: Trajectory) -> Correction:
     return plan_correction(three_axis_reference, MODELS, CONFIG)
 

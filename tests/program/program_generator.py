@@ -134,7 +134,8 @@ class ProgramWriter:
         depth = round((top if absolute else 0.0) - self._random.uniform(0.5, 20), 2)
         repeat = self._random.choice(["", "", " L2", " L3"])
         self.lines.append(
-            f"G{90 if absolute else 91} G{self._random.choice([98, 99])} G{code} {self.write_axis_words('XY')} Z{depth} R{top}"
+            f"G{90 if absolute else 91} G{self._random.choice([98, 99])} G{code} {self.write_axis_words('XY')} "
+            f"Z{depth} R{top}"
             f"{' Q' + str(round(self._random.uniform(0.7, 9), 2)) if code in ('73', '83') else ''}"
             f"{' P0.5' if code in ('82', '86', '88', '89') else ''}"
             f"{' I1.5 J-2 K' + str(round(depth + 0.3, 2)) if code == '87' else ''}{repeat if code != '74' else ''}"

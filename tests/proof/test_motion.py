@@ -1,7 +1,7 @@
 """Proves for all limits and all integers that the motion of an offset keeps its limits and reaches zero.
 
-The proven code is ``fdhil.guard.offset_limits``, unchanged. ``stopping`` and ``approach`` multiply unknowns; their contracts
-are proven first and replace them in later proofs.
+The proven code is ``fdhil.guard.offset_limits``, unchanged. ``stopping`` and ``approach`` multiply unknowns; their
+contracts are proven first and replace them in later proofs.
 """
 
 from __future__ import annotations

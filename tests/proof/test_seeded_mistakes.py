@@ -26,7 +26,8 @@ MISTAKES: tuple[tuple[Callable[..., Any], str, str, Theorem], ...] = (
      test_motion.follow_keeps_limits),
     (offset_limits.move_toward_goal, "rate + limits.acceleration)", "rate + limits.acceleration + 3)",
      test_motion.follow_keeps_limits),
-    (offset_limits.move_toward_goal, "missing = wanted - offset - wanted_rate", "missing = offset - wanted - wanted_rate",
+    (offset_limits.move_toward_goal, "missing = wanted - offset - wanted_rate", "missing = offset - wanted - "
+                                                                                "wanted_rate",
      test_motion.ramp_to_zero_ends),
     (offset_limits._limit_outward_speed, "limits.offset - outward * offset", "limits.offset + outward * offset",
      test_motion.follow_keeps_limits),

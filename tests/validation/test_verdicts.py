@@ -220,7 +220,7 @@ def test_solver_error_refuses_only_its_window(error: Exception, monkeypatch: pyt
         raise error
 
     with monkeypatch.context() as patch:
-        patch.setattr("fdhil.pipeline.window_analysis.maximum_likelihood.fit_windows", raise_error)
+        patch.setattr("fdhil.pipeline.window_analysis.fit_windows", raise_error)
         outcome = analyse_window(bad, SETTINGS)
     assert not outcome.verdict.accepted
     assert "SolverFailed" in _list_codes(outcome)

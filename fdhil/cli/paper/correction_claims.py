@@ -110,7 +110,8 @@ def _build_places_table() -> Table:
     for name in PATHS:
         before, after = path_predictions.predict_path(name), path_predictions.predict_paper_correction(name, "mirror")
         pairs = (
-            f"{path_predictions.find_largest_um(name, before, p):.0f} → {path_predictions.find_largest_um(name, after, p):.0f}"
+            f"{path_predictions.find_largest_um(name, before, p):.0f} → "
+            f"{path_predictions.find_largest_um(name, after, p):.0f}"
             for p in PLACES
         )
         rows.append([name, *pairs])

@@ -172,7 +172,8 @@ def finish_draft(draft: ConfigDraft, file: Path) -> str:
 def format_config(draft: ConfigDraft, file: Path) -> str:
     """Return the commented file."""
     head = (
-        f"{file.name}, written by fdhil init. Each value is followed by its source; {draft.guessed_count} are guessed: check "
+        f"{file.name}, written by fdhil init. Each value is followed by its source; {draft.guessed_count} are "
+        f"guessed: check "
         "them. A line that begins with # and no space is a setting at its default."
     )
     return write_filled_template(draft.document, {path: value.source for path, value in draft.values.items()}, head)

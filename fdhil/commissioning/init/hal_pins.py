@@ -1,7 +1,7 @@
 """Propose an axis' HAL pins, and the gains of the pid component before its drive, from LinuxCNC's files.
 
-The joint's feedback names the component that measures it; the other pins of that component are in ``build_hal_pins.toml``. If
-HAL runs, only existing pins are proposed. Pure.
+The joint's feedback names the component that measures it; the other pins of that component are in
+``build_hal_pins.toml``. If HAL runs, only existing pins are proposed. Pure.
 """
 
 from __future__ import annotations

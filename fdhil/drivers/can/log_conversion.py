@@ -91,7 +91,7 @@ def convert_log(path: Path, source: str, target: str) -> ConvertedLog:
     with TemporaryDirectory() as folder:
         part = Path(folder) / "log"
         frames = (frame for frame in _read_frames(path, source, Counter()) if not _is_left_out(frame, target))
-        _load_format(target).write(part, frames, header)
+        _load_format(target).write_frames(part, frames, header)
         content = part.read_bytes()
     reduced = survey.reduced + Counter({what: n for what, n in skipped.items() if what.startswith("the date")})
     left_out = survey.left_out + Counter({what: n for what, n in skipped.items() if what not in reduced})
@@ -109,7 +109,7 @@ def _is_left_out(frame: LoggedFrame, format_name: str) -> bool:
 
 def _read_frames(path: Path, format_name: str, skipped: Counter[str]) -> Iterator[LoggedFrame]:
     try:
-        yield from _load_format(format_name).read(path, skipped)
+        yield from _load_format(format_name).read_frames(path, skipped)
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its permissions") from None
 

@@ -206,7 +206,8 @@ def _assess_correction(device: DeviceDescription, profile: DriveProfile) -> Iter
         yield Capability(what, "no", why, advice)
     elif profile.unmapped_read_backs:
         why = (
-            f"no TPDO shows its {', '.join(map(format_key, profile.unmapped_read_backs))}, and offsets are only sent where "
+            f"no TPDO shows its {', '.join(map(format_key, profile.unmapped_read_backs))}, and offsets are only sent "
+            f"where "
             "they can be read back"
         )
         yield Capability(what, "no", why, advice)

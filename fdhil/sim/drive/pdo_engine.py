@@ -74,9 +74,10 @@ class Pdo:
 class PdoEngine:
     """All PDOs of one device. ``drop`` maps TPDO numbers to the number of frames still to be dropped, -1 for all.
 
-    ``heard`` has the numbers of the RPDOs received since the last SYNC, ``previous_received_numbers`` those of the cycle before;
-    ``sent`` and ``previous_sent_numbers`` also include those lost on the way by a bus fault. ``offset_rpdos`` are those that
-    carry the position offset.
+    ``heard`` has the numbers of the RPDOs received since the last SYNC, ``previous_received_numbers`` those of the
+    cycle before;
+    ``sent`` and ``previous_sent_numbers`` also include those lost on the way by a bus fault. ``offset_rpdos`` are those
+    that carry the position offset.
     """
 
     def __init__(self, dictionary: ObjectDictionary, changeable: Callable[[], bool], drop: dict[int, int]) -> None:

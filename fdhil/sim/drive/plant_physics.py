@@ -198,8 +198,8 @@ class SensedState(NamedTuple):
 class PlantPhysics:
     """One axis' mechanics and loops. Angles in rad, in the drive's own direction.
 
-    ``compute_motor_voltage_v`` (n,) holds the terminal voltage of each current step of the last cycle, ``voltage_mean_v`` their mean;
-    ``seen`` are the drive's sensor values.
+    ``compute_motor_voltage_v`` (n,) holds the terminal voltage of each current step of the last cycle,
+    ``voltage_mean_v`` their mean; ``seen`` are the drive's sensor values.
     """
 
     def __init__(

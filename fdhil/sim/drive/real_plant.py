@@ -1,7 +1,7 @@
 """Models one axis with the effects of real machines: friction, load, ripples, compliance, inverter, encoder, loops.
 
-It replaces :class:`fdhil.sim.drive.plant_physics.PlantPhysics` where ``[sim.axis.X.reality]`` names an effect, or the regulators
-have a filter or a delay. All quantities are in the drive's own direction.
+It replaces :class:`fdhil.sim.drive.plant_physics.PlantPhysics` where ``[sim.axis.X.reality]`` names an effect, or the
+regulators have a filter or a delay. All quantities are in the drive's own direction.
 """
 
 import math

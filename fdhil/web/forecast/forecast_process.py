@@ -1,6 +1,7 @@
 """Forecasts a program from the browser: its path error without and with correction, or advised feeds.
 
-Runs as a child process (``python -m fdhil.web.forecast.forecast_process``, one JSON request on stdin), at low priority and with
+Runs as a child process (``python -m fdhil.web.forecast.forecast_process``, one JSON request on stdin), at low priority
+and with
 limited time, memory and disk, so that no program can delay the daemon or the pages. It reads the history and writes
 into the given folder; nothing is sent to any machine.
 """

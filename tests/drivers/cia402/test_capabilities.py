@@ -71,7 +71,8 @@ def test_servo_with_position_offset_can_be_corrected(tmp_path: Path) -> None:
 CASES: dict[str, tuple[tuple[Variable, ...], str, str, str]] = {
     "no offset": (remove_objects(SERVO, 0x60B0), "correct on line", "no", "no position offset (60B0)"),
     "offset for no PDO": (change_objects(SERVO, 0x60B0, "rw", 0), "correct on line", "no", "no RPDO can carry its 60B0"),
-    "offset for RPDOs": (change_objects(SERVO, 0x60B0, "rww"), "correct on line", "perhaps", "only a test on the drive shows"),
+    "offset for RPDOs": (change_objects(SERVO, 0x60B0, "rww"), "correct on line", "perhaps", "only a test on the "
+                                                                                             "drive shows"),
     "mode not shown": (change_objects(SERVO, 0x6061, "ro", 0), "correct on line", "no", "no TPDO shows its 6061:00"),
     "no feed-forward": (remove_objects(SERVO, 0x60B2), "feed-forward", "no", "60B1, 60B2"),
     "no current": (remove_objects(SERVO, 0x6078), "listen", "no", "current (6077:00)"),
@@ -82,7 +83,8 @@ CASES: dict[str, tuple[tuple[Variable, ...], str, str, str]] = {
     "no inputs": (remove_objects(SERVO, 0x60FD), "rapid signal", "no", "inferred"),
     "no modes": (remove_objects(SERVO, 0x6502), "follow an NC", "perhaps", "6502"),
     "no CSP": (
-        (*remove_objects(SERVO, 0x6502), (0x6502, 0, U32, "ro", 0, 0x25)), "follow an NC", "no", "no mode 8 (6502 = 00000025)"
+        (*remove_objects(SERVO, 0x6502), (0x6502, 0, U32, "ro", 0, 0x25)), "follow an NC", "no", "no mode 8 (6502 = "
+                                                                                                 "00000025)"
     ),
     "another voltage": (
         (*SERVO, (0x2611, 2, I16, "ro", 1, None)), "voltage", "no", "wire a sensor"
