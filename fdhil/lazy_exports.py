@@ -9,12 +9,12 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-_EXPORT = re.compile(r"^from \.([\w.]+) import (\w+) as \w+$", re.MULTILINE)
+EXPORT = re.compile(r"^from \.([\w.]+) import (\w+) as \w+$", re.MULTILINE)
 
 
 def export_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package, from the stub next to its ``__init__.py``."""
-    modules = {name: module for module, name in _EXPORT.findall(Path(file).with_suffix(".pyi").read_text("utf-8"))}
+    modules = {name: module for module, name in EXPORT.findall(Path(file).with_suffix(".pyi").read_text("utf-8"))}
 
     def import_name(name: str) -> object:
         if name not in modules:

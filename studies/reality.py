@@ -380,8 +380,8 @@ def page(told: pages.Run, figures: Mapping[str, Any]) -> str:
     short = [name for k, name in enumerate(PARAMETERS) if _compute_coverage(several, "deviations", k)[0] < LEAST_HELD]
     if short:
         lines += wrap_paragraph(
-            f"""The pools' intervals of {pages.join_words(short)} are too narrow: what bends every rapid alike, a screw that
-            gives or friction at low speed that none of them surely shows, does not average away."""
+            f"""The pools' intervals of {pages.join_words(short)} are too narrow: what bends every rapid alike, a screw
+            that gives or friction at low speed that none of them surely shows, does not average away."""
         )
     lines += ["## Each effect alone, and all together", ""]
     names = ["base", "machine", "rapids believed", "pool", "errors of R L K Jt ft Cd, %", "left of following error, um"]

@@ -51,7 +51,7 @@ def record_slow_windows(
     moves: int = 1,
     begin_s: float = 0.0017,
 ) -> list[Window]:
-    """Return the rapids of a shuttle; sample j of the voltage truly covers ``begin_s`` + j ``period_s`` - ``measure_delay_s``.
+    """Return the rapids of a shuttle; voltage sample j truly begins at ``begin_s`` + j ``period_s`` - ``delay_s``.
 
     The true voltage is taken from the bench every 31.25 us, so means and instants are the sensor's own.
     """

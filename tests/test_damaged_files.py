@@ -98,8 +98,8 @@ def test_program_check_with_flipped_bit_is_repeated(tmp_path: Path) -> None:
     rows = bytes(range(256)) * 16
     errors = {"before": {"rms_um": 1.0, "max_um": 2.0}, "after": {"rms_um": 0.1, "max_um": 0.2}}
     blocks = [[512, hashlib.sha256(rows).hexdigest()]]
-    header = {"schema": SCHEMA, "axes": ["X"], "code": compute_code_digest(), "blocks": blocks, "files": {}, "rows": 512,
-              "largest_um": 3.0, "refused": [], **errors}  # fmt: skip
+    header = {"schema": SCHEMA, "axes": ["X"], "code": compute_code_digest(), "blocks": blocks, "files": {},
+              "rows": 512, "largest_um": 3.0, "refused": [], **errors}  # fmt: skip
 
     def write_check(body: BinaryIO) -> dict[str, object]:
         body.write(rows)

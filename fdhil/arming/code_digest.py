@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 
 import fdhil
+from fdhil.lazy_exports import EXPORT
 
 MAKER = "fdhil.arming.program_check"
 LIBRARIES = (np, scipy, numba)  # that compute the rows
@@ -38,6 +39,7 @@ def find_code_files(home: Path) -> dict[str, bytes]:
             continue
         seen.add(module)
         place = home.joinpath(*module.split(".")[1:])
+        waiting += _find_export(home, module)
         for file in (place.with_suffix(".py"), place / "__init__.py"):
             if file.is_file():
                 content = found[str(file.relative_to(home))] = file.read_bytes()
@@ -45,6 +47,14 @@ def find_code_files(home: Path) -> dict[str, bytes]:
                     waiting += _find_imports(content.decode())
         waiting.append(module.rpartition(".")[0] or "fdhil")  # a package is imported with its modules
     return found
+
+
+def _find_export(home: Path, module: str) -> list[str]:
+    """Return the module from which a package exports a name: what looks like a module of it may be one."""
+    package, _, name = module.rpartition(".")
+    stub = home.joinpath(*package.split(".")[1:], "__init__.pyi")
+    exports = EXPORT.findall(stub.read_text("utf-8")) if stub.is_file() else []
+    return [f"{package}.{file}" for file, exported in exports if exported == name]
 
 
 def _find_imports(text: str) -> Iterator[str]:

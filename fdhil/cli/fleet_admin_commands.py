@@ -35,8 +35,8 @@ def service(
     when = datetime.now(UTC).replace(microsecond=0) if at is None else at.replace(tzinfo=UTC)
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet import enter_service, parameter_sets, remove_service
-    with parameter_sets.open_database(settings) as db:
+        from fdhil.fleet import enter_service, open_database, remove_service
+    with open_database(settings) as db:
         if remove:
             answer = remove_service(db, machine, axis or "", when)
         else:
@@ -67,8 +67,8 @@ def retain(fleet: Path, as_json: bool) -> None:
     """
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet import apply_retention, parameter_sets
-    with parameter_sets.open_database(settings) as db:
+        from fdhil.fleet import apply_retention, open_database
+    with open_database(settings) as db:
         answer = apply_retention(db, settings, datetime.now(UTC), print_progress)
     fleet_view.print_answer(answer, "retain", as_json)
 
@@ -87,8 +87,8 @@ def export(fleet: Path, folder: Path, labels: tuple[str, ...], key: Path | None,
     """
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet import export_tables, load_or_create_key, parameter_sets
-    with parameter_sets.open_read_only(settings) as db:
+        from fdhil.fleet import export_tables, load_or_create_key, open_read_only
+    with open_read_only(settings) as db:
         answer = export_tables(
             db, folder, load_or_create_key(key or fleet.parent / "anonymous.key"), labels, print_progress
         )

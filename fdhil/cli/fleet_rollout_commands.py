@@ -102,21 +102,29 @@ def stage(
 
     settings = load_fleet_config(fleet)
     with require_fleet_extra():
-        from fdhil.fleet import rollout
-    proposal, days = rollout.read_change(change)
+        from fdhil.fleet import (
+            choose_machines,
+            connect_database,
+            create_offer,
+            open_stage,
+            read_change,
+            read_rollout_status,
+            withdraw_change,
+        )
+    proposal, days = read_change(change)
     if key_file is not None and not by:
         raise click.UsageError("--key signs a stage; name the signer with --by")
     if key_file is not None and withdraw:
         raise click.UsageError("--withdraw and --key exclude each other; give only one of them")
 
     async def advance_rollout() -> tuple[RolloutStatus, Offer | None, list[str]]:
-        async with rollout.open_database(settings) as db:
-            found = await rollout.read_rollout_status(db, proposal)
+        async with connect_database(settings) as db:
+            found = await read_rollout_status(db, proposal)
             if key_file is None:
-                return found, None, await rollout.withdraw_change(settings, found, proposal.name) if withdraw else []
-            names = rollout.choose_machines(found, count, machines, despite)
-            offer = rollout.create_offer(proposal, days, by, found.stage + 1, names)
-            await rollout.open_stage(settings, db, offer, proposal, key_file, despite)
+                return found, None, await withdraw_change(settings, found, proposal.name) if withdraw else []
+            names = choose_machines(found, count, machines, despite)
+            offer = create_offer(proposal, days, by, found.stage + 1, names)
+            await open_stage(settings, db, offer, proposal, key_file, despite)
             return found, offer, []
 
     found, opened, withdrawn = asyncio.run(advance_rollout())

@@ -72,7 +72,8 @@ def describe_groups(answer: Mapping[str, Any]) -> Iterator[str]:
         outliers = {each["machine"] for each in group["outliers"]}
         for each in group["sisters"]:
             mark = "  DIFFERS FROM ITS PEERS" if each["machine"] in outliers else ""
-            yield f"  {each['machine']:24}  {answer['parameter']} = {_format_number(each['value'])} {answer['unit']}{mark}"
+            value = f"{_format_number(each['value'])} {answer['unit']}"
+            yield f"  {each['machine']:24}  {answer['parameter']} = {value}{mark}"
         if group["median"] is not None:
             yield f"  median {_format_number(group['median'])}, spread {100 * group['spread']:.1f} %"
     if not answer["groups"]:
@@ -143,6 +144,6 @@ def _format_number(value: float | None) -> str:
 
 
 LINES: Mapping[str, Lines] = {
-    "status": describe_status, "trend": describe_trend, "compare": describe_groups, "outliers": describe_outliers, "service": describe_service,
-    "services": describe_services, "retain": describe_retention, "export": describe_export,
+    "status": describe_status, "trend": describe_trend, "compare": describe_groups, "outliers": describe_outliers,
+    "service": describe_service, "services": describe_services, "retain": describe_retention, "export": describe_export,
 }  # fmt: skip

@@ -95,7 +95,7 @@ def compare_zones(
 
     None if there is no such prediction.
     """
-    from fdhil.prediction import error_forecast
+    from fdhil.prediction import compare_zones as compare_zone_errors
     from fdhil.records import Zone
 
     before = next(((stamp, old) for stamp, old in past.comparisons if not _is_same_basis(old, now)), None)
@@ -106,7 +106,7 @@ def compare_zones(
     models = {axis: used.parameters for axis, used in now.used.items()}
     earlier = {axis: used.parameters for axis, used in old.used.items() if axis in models}
     same_settings = old.config_digest == now.config_digest
-    changes = error_forecast.compare_zones(predicted, models, earlier, std_um, recorded, config, same_settings)
+    changes = compare_zone_errors(predicted, models, earlier, std_um, recorded, config, same_settings)
     return {
         "at": datetime.datetime.fromtimestamp(stamp.wall_s, datetime.UTC).isoformat(timespec="seconds"),
         "revisions": {axis: used.revision for axis, used in old.used.items()},
@@ -192,14 +192,14 @@ def estimate_step_costs(
 
     Raises click.UsageError if no axis has that revision.
     """
-    from fdhil.prediction import error_forecast
+    from fdhil.prediction import compute_step_costs, find_last_step
 
     now = {axis: found[-1].set for axis, found in past.revisions.items() if found}
     earlier = {}
     for axis, found in past.revisions.items():
         sets = [revision.set for revision in found]
         if since is None:
-            place = error_forecast.find_last_step(sets)
+            place = find_last_step(sets)
         else:
             place = next((k for k, one in enumerate(sets) if one.revision == since), None)
         if place is not None:
@@ -208,7 +208,7 @@ def estimate_step_costs(
         raise click.UsageError(
             f"--since: there is no revision {since} among the last {RECENT}; fdhil history lists them"
         )
-    return error_forecast.compute_step_costs(predicted, models, earlier, now, config)
+    return compute_step_costs(predicted, models, earlier, now, config)
 
 
 def describe_steps(found: Sequence[ParameterStep]) -> list[dict[str, Any]]:
@@ -253,17 +253,15 @@ def predict_crossings(
     ``compute_observed_days``).
     """
     from fdhil.identification import limit_forecast_days
-    from fdhil.prediction import error_forecast
+    from fdhil.prediction import compute_observed_days, fit_parameter_trend, predict_tolerance_crossing
 
     newest = max((found[-1].stamp.wall_s for found in past.revisions.values() if found), default=0.0)
     courses = {
-        axis: error_forecast.fit_parameter_trend(
-            [r.set for r in past.revisions[axis]], _convert_to_days(past.revisions[axis], newest)
-        )
+        axis: fit_parameter_trend([r.set for r in past.revisions[axis]], _convert_to_days(past.revisions[axis], newest))
         for axis in predicted.reference.axes
         if past.revisions.get(axis)
     }
-    span_days = error_forecast.compute_observed_days(courses)
+    span_days = compute_observed_days(courses)
     within_days = min(limit_forecast_days(span_days), FAR_DAYS)
     entries: list[dict[str, Any]] = []
     for zone, per_axis in zip(predicted.zones, um_per_percent, strict=True):
@@ -273,7 +271,7 @@ def predict_crossings(
         if not within_days:
             entries.append({"state": "not_enough_history", "span_days": span_days})
             continue
-        found = error_forecast.predict_tolerance_crossing(zone, per_axis, models, courses, tolerance_um)
+        found = predict_tolerance_crossing(zone, per_axis, models, courses, tolerance_um)
         if found is None or found.days > within_days:
             entries.append({"state": "not_foreseen", "within_days": within_days})
             continue

@@ -22,10 +22,11 @@ def build_figure(histories: Sequence[AxisHistory]) -> Figure:
     from matplotlib import style
     from matplotlib.figure import Figure
 
-    from fdhil.report import chart
+    import fdhil.report
+    from fdhil.report import draw_panel
 
     names = list(dict.fromkeys(name for history in histories for name in history.list_parameters()))
-    with style.context(Path(chart.__file__).with_name("fdhil.mplstyle")):
+    with style.context(Path(fdhil.report.__file__).with_name("fdhil.mplstyle")):
         tall = HEIGHT * len(names) + HEAD + FOOT
         figure = Figure(figsize=(WIDTH * len(histories), tall))
         panels = figure.subplots(len(names), len(histories), squeeze=False, sharex="col")
@@ -37,7 +38,7 @@ def build_figure(histories: Sequence[AxisHistory]) -> Figure:
             column[0].set_title(f"axis {history.axis}", loc="left", fontweight="bold")
             for panel, name in zip(column, names, strict=True):
                 course = build_time_chart(history, name)
-                chart.draw_panel(panel, course.panels[0], course)
+                draw_panel(panel, course.panels[0], course)
                 panel.set_ylabel(typeset_text(course.panels[0].y_label))
         named = panels[0, 0].get_legend_handles_labels()
         figure.legend(*named, loc="upper right", ncols=3 if len(histories) > 1 else 1, fontsize=8)

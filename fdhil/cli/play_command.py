@@ -128,7 +128,7 @@ def _is_enter_pressed() -> bool:
 def _confirm_records(
     machine: MachineConfig, records: Mapping[str, CommissioningRecord], as_compared: Callable[[], set[str]]
 ) -> None:
-    """Confirm the commissioning records of the drives that are still ``find_axes_without_reboot``; the write to 0x1016 was ours.
+    """Confirm the commissioning records of the drives that have not rebooted; the write to 0x1016 was ours.
 
     The doubts of the guard and of the store are read before each comparison, so later doubts remain.
     """

@@ -112,8 +112,8 @@ def _format_notice(notice: Mapping[str, Any]) -> str:
     given = notice.get("acknowledged")
     seen = f" (acknowledged by {given['who']})" if given else ""
     number = f"  {notice['number']:>4}" if notice.get("number") is not None else "      "
-    line = f"{_format_age(notice['age_s']):>9} ago{number}  {notice['severity']:5}  {axis}{notice['code']}: {notice['text']}"
-    return line + seen
+    line = f"{_format_age(notice['age_s']):>9} ago{number}  {notice['severity']:5}  "
+    return f"{line}{axis}{notice['code']}: {notice['text']}{seen}"
 
 
 def _describe_source(status: Mapping[str, Any]) -> str:
@@ -145,9 +145,10 @@ def _describe_guard(guard: Mapping[str, Any]) -> str:
 def format_lateness(recent: Mapping[str, Any]) -> str:
     """Return the lateness of this PC in the last minute or two, measured by the guard, as text."""
     worst = f"the slowest after {recent['worst_us'] / 1e3:.2f} ms"
+    turns = group_digits(recent["turns"])
     if not recent["late"]:
-        return f"this PC: none of the last {group_digits(recent['turns'])} offsets late, {worst}"
-    return f"[red]this PC: {group_digits(recent['late'])} of the last {group_digits(recent['turns'])} offsets late[/red], {worst}"
+        return f"this PC: none of the last {turns} offsets late, {worst}"
+    return f"[red]this PC: {group_digits(recent['late'])} of the last {turns} offsets late[/red], {worst}"
 
 
 def format_nc_state(nc: Mapping[str, Any]) -> str:

@@ -149,8 +149,9 @@ def _prove_offset_step(hal: HalAxis) -> tuple[float, int]:
     for um in steps:
         step = round(um * 1e-3 * hal.per_mm)
         after = _hold_offset(hal, step)
-        if abs(after.average_newest(after.applied) - step) > 1.5:
-            text = f"an offset of {um:g} um was sent, but HAL applies {after.average_newest(after.applied) / hal.per_mm * 1e3:.1f}"
+        applied = after.average_newest(after.applied)
+        if abs(applied - step) > 1.5:
+            text = f"an offset of {um:g} um was sent, but HAL applies {applied / hal.per_mm * 1e3:.1f}"
             raise DriveFault(
                 hal.device, f"{text} um; load fdhil's HAL file, and compare [axis.X.correction] with limit3"
             )

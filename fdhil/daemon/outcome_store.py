@@ -261,7 +261,8 @@ class OutcomeStore:
                 self._require_in_place(self._history)
                 self._history.write_checkpoint()
                 self.notices.note_acknowledged(given)
-        text = f"{describe_numbers(given.notices)} acknowledged by {given.who}; {self.notices.build_status()['count']} more are open"
+        still_open = self.notices.build_status()["count"]
+        text = f"{describe_numbers(given.notices)} acknowledged by {given.who}; {still_open} more are open"
         service_log.write_line(text)
         return {"ok": True, "text": text, "acknowledged": list(given.notices)}
 

@@ -11,6 +11,7 @@ from .offer_review import build_backup_path as build_backup_path
 from .offer_review import load_current_machine as load_current_machine
 from .offer_review import reject_offer as reject_offer
 from .offer_review import review_offer as review_offer
+from .parameter_sets import open_database as open_database
 from .parameter_sets import open_read_only as open_read_only
 from .reanalysis import WindowScope as WindowScope
 from .reanalysis import ignore_progress as ignore_progress
@@ -21,8 +22,8 @@ from .retention import apply_retention as apply_retention
 from .rollout import MachineResponse as MachineResponse
 from .rollout import RolloutStatus as RolloutStatus
 from .rollout import choose_machines as choose_machines
+from .rollout import connect_database as connect_database
 from .rollout import create_offer as create_offer
-from .rollout import open_database as open_database
 from .rollout import open_stage as open_stage
 from .rollout import read_change as read_change
 from .rollout import read_rollout_status as read_rollout_status

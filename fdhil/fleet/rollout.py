@@ -114,7 +114,7 @@ def create_offer(change: ProposedChange, days: int, by: str, stage: int, machine
 
 
 @asynccontextmanager
-async def open_database(fleet: Fleet) -> AsyncIterator[Db]:
+async def connect_database(fleet: Fleet) -> AsyncIterator[Db]:
     """Open the database with its tables up to date; ConnectError where that fails."""
     try:
         connection = fleet.database.connection

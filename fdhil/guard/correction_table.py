@@ -78,7 +78,10 @@ def _encode_int32(values: Column) -> bytes:
 
 
 def decode_table(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], CorrectedPath]:
-    """Return the axes and rows of a table; TableRefused (``CorruptFile``) when it is not what ``encode_table`` writes."""
+    """Return the axes and rows of a table.
+
+    TableRefused (``CorruptFile``) when it is not what ``encode_table`` writes.
+    """
     try:
         (length,) = _LENGTH.unpack_from(body)
         if length > MAX_HEAD_BYTES:

@@ -73,8 +73,9 @@ class DescriptorCloser:
 
 @dataclass(slots=True, eq=False)
 class GuardSocketClient:
-    """One connection; ``last_request_s``: time of its last request (monotonic), ``armed``: whether it armed the correction.
+    """One connection to the guard.
 
+    ``last_request_s``: time of its last request (monotonic), ``armed``: whether it armed the correction.
     ``descriptor`` came with the requests that are read now; only a request that needs it takes it.
     """
 

@@ -78,7 +78,10 @@ def compute_stopping_distance(rate: int, acceleration: int) -> int:
 
 
 def compute_approach_rate(distance: int, acceleration: int) -> int:
-    """Return the largest rate u with u + its stopping distance <= ``distance`` >= 0: the fastest move that still stops there."""
+    """Return the largest rate u with u + its stopping distance <= ``distance`` >= 0.
+
+    It is the fastest move that still stops there.
+    """
     steps = (isqrt(8 * distance // acceleration + 1) + 1) // 2
     return (distance + acceleration * steps * (steps - 1) // 2) // steps
 

@@ -125,13 +125,13 @@ class Motion:
         return np.interp(begins, np.arange(self.n) * self.dt_s, course)
 
     def shift_voltage(self, delay_s: float) -> Motion:
-        """Return the motion with its voltage earlier by ``measure_delay_s``."""
+        """Return the motion with its voltage earlier by ``delay_s``."""
         if self.slow is not None:
             return replace(self, slow=replace(self.slow, begin_s=self.slow.begin_s - delay_s))
         return replace(self, voltage_mean=self.compute_delayed_voltage(delay_s))
 
     def compute_delayed_voltage(self, delay_s: float) -> Float:
-        """Return the mean voltage (n,) of each interval, corrected for a voltage that is late by ``measure_delay_s``."""
+        """Return the mean voltage (n,) of each interval, corrected for a voltage that is late by ``delay_s``."""
         if delay_s == 0.0:
             return self.voltage_mean
         rows = delay_s / self.dt_s

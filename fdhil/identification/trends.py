@@ -155,7 +155,7 @@ def find_crossing(line: Slope, limit: float) -> Crossing | None:
 
 
 def limit_forecast_days(span_days: float) -> float:
-    """Return how many days ahead a slope observed over ``compute_observed_days`` may be extrapolated; 0 for too short a span."""
+    """Return how many days ahead a slope observed over ``span_days`` may be extrapolated; 0 for too short a span."""
     return FARTHEST_SPANS * span_days if span_days >= LEAST_DAYS else 0.0
 
 

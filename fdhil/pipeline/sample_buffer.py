@@ -222,7 +222,7 @@ class SampleBuffer:
 
 @dataclass(frozen=True, slots=True)
 class _GridAlignment:
-    """Sensor sample ``offset`` + ``ratio`` * k begins with tick k, except that the voltage is late by ``measure_delay_s``."""
+    """Sensor sample ``offset`` + ``ratio`` * k begins with tick k, except that the voltage is late by ``delay_s``."""
 
     ratio: int
     offset: int

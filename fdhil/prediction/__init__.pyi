@@ -25,6 +25,7 @@ from .correction_gain import predict_gain as predict_gain
 from .demand_retiming import make_demand_sources as make_demand_sources
 from .error_forecast import ParameterStep as ParameterStep
 from .error_forecast import ZoneChange as ZoneChange
+from .error_forecast import compare_zones as compare_zones
 from .error_forecast import compute_observed_days as compute_observed_days
 from .error_forecast import compute_step_costs as compute_step_costs
 from .error_forecast import find_last_step as find_last_step

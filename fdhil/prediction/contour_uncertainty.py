@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.model import closed_loop
+from fdhil.model import run_per_axis, simulate_axis
 from fdhil.prediction.contour_error import compute_contour_error_um
 from fdhil.prediction.model_variants import get_main_term, list_values
 from fdhil.prediction.path_prediction import check_axes
@@ -35,19 +35,19 @@ def _simulate_perturbed(
     """Return per axis positions (k, n) with each value perturbed in turn, the steps (k,), and unperturbed ones (n,)."""
     check_axes(reference, models, config)
 
-    def simulate_axis(axis: str) -> tuple[Float, Float, Float]:
+    def simulate_varied_axis(axis: str) -> tuple[Float, Float, Float]:
         offset_mm = None if offset_um is None else offset_um[axis] * 1e-3
         path = reference.position_mm[axis]
         changed, steps = zip(
             *(_perturb_parameter(models[axis], name) for name in list_values(models[axis])), strict=True
         )
         here, *moved = (
-            closed_loop.simulate_axis(model, config.axis[axis], reference.dt_s, path, offset_mm).table_mm
+            simulate_axis(model, config.axis[axis], reference.dt_s, path, offset_mm).table_mm
             for model in (models[axis], *changed)
         )
         return np.array(moved), np.array(steps), here
 
-    return closed_loop.run_per_axis(simulate_axis, reference.axes)
+    return run_per_axis(simulate_varied_axis, reference.axes)
 
 
 def compute_contour_std_um(

@@ -163,8 +163,10 @@ class CutterCompensation:
         """Return the arc around an outside corner, at the height of the piece before it; a rapid goes straight."""
         last = before.waiting[-1].whole if before.waiting and before.waiting[-1].whole else before.whole
         whole = next((w.whole for w in reversed(before.waiting) if w.whole), last)
-        return CompensatedPiece(piece.block, before.end, piece.start, before.corner, before.leaving, piece.heading, list(whole),
-                     piece.feed, before.corner, -self.side, 2.0 * math.pi)  # fmt: skip
+        return CompensatedPiece(
+            piece.block, before.end, piece.start, before.corner, before.leaving, piece.heading, list(whole), piece.feed,
+            before.corner, -self.side, 2.0 * math.pi,
+        )  # fmt: skip
 
 
 def _check_gouging(piece: CompensatedPiece, block: Block) -> CompensatedPiece:

@@ -106,7 +106,8 @@ def build_latest_rows(history: AxisHistory, shares: Mapping[str, float]) -> list
         rows.append([
             name, format_cell(name, value, compute_half_width(newest[name]), " "), unit,
             "-" if nominal is None else f"{nominal * factor:.4g}", _format_percent(value, nominal),
-            _format_percent(value, first.get(name, {}).get("value")), f"±{100 * shares[name]:.0f} %", _describe_limit(limits.get(name)),
+            _format_percent(value, first.get(name, {}).get("value")), f"±{100 * shares[name]:.0f} %",
+            _describe_limit(limits.get(name)),
         ])  # fmt: skip
     return rows
 

@@ -102,7 +102,7 @@ class SimulatedAxis:
         self.drive.overwrite_mapping(index, [(word >> 16, word >> 8 & 0xFF, word & 0xFF) for word in words])
 
     def update_after_cycle(self, voltage_v: float) -> None:
-        """Update slide-way and sensor after a cycle; ``compute_motor_voltage_v`` is the mean over the cycle before it."""
+        """Update slide-way and sensor after a cycle; ``voltage_v`` is the mean over the cycle before it."""
         drive = self.drive
         celsius = self.slide_way.advance_temperature(drive.physics.speed_rad_s)
         self.sensor.feed_mean_voltage(drive.ratings.sign * voltage_v)

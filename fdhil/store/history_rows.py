@@ -148,7 +148,8 @@ def _decode_revision(row: Mapping[str, Any]) -> Revision:
     covariance: Float = freeze_array(np.array(json.loads(row["covariance"]), dtype=np.float64))
     published = ParameterSet(
         row["axis"], row["revision"], parameters, covariance, row["windows"], row["tick"], row["temperature_c"],
-        row["config_digest"], (), row.get("unexplained_um"), _decode_warnings(row), json.loads(row.get("loops") or "null"),
+        row["config_digest"], (), row.get("unexplained_um"), _decode_warnings(row),
+        json.loads(row.get("loops") or "null"),
     )  # fmt: skip
     return Revision(row["id"], published, tuple(json.loads(row["window_ids"])), _decode_stamp(row))
 

@@ -106,7 +106,8 @@ def _find_speed_dip(window: Window, seen: Float, plateau: float, begin: int, ove
     k = int(np.argmax(depth))
     if depth[k] <= max(LEAST_DIP * plateau, overshoot[k]):
         return None
-    return f"the speed falls from {plateau:.4g} to {seen[k]:.4g} mm/s at {_format_time(window, begin + k)} s and rises again"
+    lowest_s = _format_time(window, begin + k)
+    return f"the speed falls from {plateau:.4g} to {seen[k]:.4g} mm/s at {lowest_s} s and rises again"
 
 
 def _find_held_speed(window: Window, seen: Float, plateau: float, begin: int) -> str | None:

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.identification import compute_term_voltage_v, fill_forward, list_missing_reasons
-from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification import LikelihoodFit, compute_term_voltage_v, fill_forward, list_missing_reasons
 from fdhil.model import discretise_plant, simulate_plant
 from fdhil.records import Estimate, Float, Parameters, Window
 

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.identification import estimate_aliasing_doubt, estimate_open_voltage_v, invert_symmetric
-from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification import LikelihoodFit, estimate_aliasing_doubt, estimate_open_voltage_v, invert_symmetric
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.score_tests import LAGS, compute_expected_autocorrelation

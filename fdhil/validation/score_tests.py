@@ -16,6 +16,7 @@ from fdhil.identification import (
     LOAD,
     SPEED,
     VOLTAGE,
+    LikelihoodFit,
     Motion,
     compute_innovations,
     compute_low_rate_innovations,
@@ -24,7 +25,6 @@ from fdhil.identification import (
     estimate_aliasing_doubt,
     invert_symmetric,
 )
-from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
 from fdhil.records import Float, Reason
 from fdhil.validation.false_alarm_budget import BUDGET
 

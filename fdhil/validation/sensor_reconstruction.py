@@ -15,13 +15,13 @@ import numpy as np
 from fdhil.identification import (
     BROKEN_MODE,
     DELAY,
+    LikelihoodFit,
     Modes,
     compute_departure,
     compute_load_nm,
     compute_motor_voltage_v,
     compute_moving_mean,
 )
-from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
 from fdhil.records import Float
 
 NEIGHBOUR_S = 0.040  # around the doubted rows that are included: some time constants of a winding

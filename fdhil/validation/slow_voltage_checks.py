@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.identification import (
+    LikelihoodFit,
     Motion,
     build_sample_regressors,
     compute_innovations,
@@ -25,12 +26,11 @@ from fdhil.identification import (
     estimate_noise_std,
     fill_forward,
     find_resolution,
+    fit_parameters_and_noise,
     invert_symmetric,
     smooth_samples,
     sort_runs_by_length,
 )
-from fdhil.identification.estimators import maximum_likelihood
-from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
 from fdhil.records import Float, Reason, SlowVoltage, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.repeated_readings import compute_repeat_probability
@@ -184,7 +184,7 @@ def check_slow_current_delay(window: Window, fit: LikelihoodFit, least_gain: flo
             break
         rows += step
         earlier = plain.current[np.clip(np.arange(plain.n) + rows, 0, plain.n - 1)]
-        last = maximum_likelihood.fit_parameters_and_noise([replace(plain, current=earlier)], last.theta, last.free)
+        last = fit_parameters_and_noise([replace(plain, current=earlier)], last.theta, last.free)
         if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return
         found, _ = _estimate_current_delay(last)

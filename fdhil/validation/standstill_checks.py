@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.identification import (
+    LikelihoodFit,
     NoiseLevels,
     build_estimate,
     compute_term_voltage_v,
@@ -14,7 +15,6 @@ from fdhil.identification import (
     invert_symmetric,
     smooth_samples,
 )
-from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
 from fdhil.records import Reason, Window
 from fdhil.validation.false_alarm_budget import BUDGET
 from fdhil.validation.table_assessment import TableAssessment

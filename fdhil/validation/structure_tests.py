@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification import Motion, fill_forward
-from fdhil.identification.estimators.maximum_likelihood import LikelihoodFit
+from fdhil.identification import LikelihoodFit, Motion, fill_forward
 from fdhil.records import Float
 from fdhil.validation.score_tests import Finding, ScoreTest
 

@@ -134,7 +134,8 @@ class TableErrorBudget:
         """Return why the model is not accepted."""
         advice = "the drive has an effect that the model lacks, or current and speed are not sampled at one instant"
         if self.through != "replay":
-            text = f"the torque that the model leaves unexplained causes {self.format_error(self.unexplained_um)} at the table"
+            error = self.format_error(self.unexplained_um)
+            text = f"the torque that the model leaves unexplained causes {error} at the table"
             return Reason("ValidationFailed", f"{text}, limit {self.format_error(self.limit_um)}", advice)
         text = (
             f"the closed loop with this model leaves {self.unexplained_um:.3g} um RMS of a following error of "

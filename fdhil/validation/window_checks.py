@@ -163,8 +163,9 @@ def _check_stick_slip(table: TableAssessment) -> Iterator[Reason]:
         known = budget.is_within_limit(um) or budget.is_within_limit(table.rest_position_error_um)
         if resting.deviation_nm < more <= least < more + beyond and not known:
             may = f"friction at low speed is {more:.3g} +- {beyond:.2g} N.m {text} may slip"
-            limit = f"its position at rest is known to {budget.format_error(um)}, limit {budget.format_error(budget.limit_um)}"
-            yield Reason("ValidationFailed", f"{may}, and {limit}", advice)
+            known_to = f"its position at rest is known to {budget.format_error(um)}"
+            limit = f"limit {budget.format_error(budget.limit_um)}"
+            yield Reason("ValidationFailed", f"{may}, and {known_to}, {limit}", advice)
 
 
 def _check_fit_exists(table: TableAssessment) -> Iterator[Reason]:

@@ -161,8 +161,8 @@ def make_server(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callabl
     settings = uvicorn.Config(
         app,
         log_config=None, log_level="error", access_log=False, server_header=False, proxy_headers=False,
-        http=BoundedHttpProtocol, ws=BoundedWebSocketProtocol, ws_max_size=LARGEST_MESSAGE, limit_concurrency=MOST_CONNECTIONS,
-        timeout_keep_alive=KEEP_ALIVE_S, timeout_graceful_shutdown=STOP_S,
+        http=BoundedHttpProtocol, ws=BoundedWebSocketProtocol, ws_max_size=LARGEST_MESSAGE,
+        limit_concurrency=MOST_CONNECTIONS, timeout_keep_alive=KEEP_ALIVE_S, timeout_graceful_shutdown=STOP_S,
     )  # fmt: skip
     settings.load()
     settings.ssl = certificate

@@ -51,8 +51,10 @@ def examine_machine(kind: Kind, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         columns = write_machine(place, axes, seed)
-        identified = _run_command("identify", *(f"{place}/{name}.csv" for name in axes), "--config", f"{place}/machine.toml",
-                            "--write-model", f"{place}/model.json")  # fmt: skip
+        identified = _run_command(
+            "identify", *(f"{place}/{name}.csv" for name in axes),
+            "--config", f"{place}/machine.toml", "--write-model", f"{place}/model.json",
+        )  # fmt: skip
         files = {document["axis"]: document for document in identified["files"]}
         found = {name: _examine_axis(files[name], axis, columns[name]) for name, axis in axes.items()}
         believed = all(axis["pool"] for axis in found.values())

@@ -60,7 +60,7 @@ def make_path(feed_m_s: float, period_s: float, smoothing_s: tuple[float, float]
 
 
 def measure_distance_um(path_m: Array, points_m: Array, period_s: float, reach_s: float = 0.4) -> Array:
-    """Return the distance (n,) in um of each point from the polyline of the path within ``checked_until_s`` of its time."""
+    """Return the distance (n,) in um of each point from the polyline of the path within ``reach_s`` of its time."""
     reach = round(reach_s / period_s)
     found = np.empty(len(points_m))
     for k, point in enumerate(points_m):

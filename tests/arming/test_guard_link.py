@@ -114,7 +114,7 @@ async def test_abandoned_program_is_not_armed(
 
         demand = {"X": [0], "Y": [0]}
         begin = TablePiece(0, demand, demand, True)
-        return SimpleNamespace(facts={}, begin=begin, rows=1, summary=lambda: {"method": "inverse"})
+        return SimpleNamespace(facts={}, first_piece=begin, row_count=1, summarise=lambda: {"method": "inverse"})
 
     monkeypatch.setattr(
         "fdhil.arming.arming_service.prepare_request",
@@ -179,7 +179,7 @@ async def test_invalid_program_or_token_text_is_refused(
 async def test_disarm_during_preparation_prevents_arming(
     config: MachineConfig, guard: GuardPeer, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    feeding = SimpleNamespace(laws={}, facts={}, summary=dict, progress=dict)
+    feeding = SimpleNamespace(laws={}, facts={}, summarise=dict, report_progress=dict)
     monkeypatch.setattr("fdhil.arming.arming_service.prepare_feedforward", lambda *_: feeding)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
     desk = ArmingService(config, OutcomeStore(config), folder)
@@ -206,7 +206,7 @@ async def test_arm_request_carries_disarm_count(
 ) -> None:
     desk = ArmingService(config, OutcomeStore(config), folder)
     desk.start_from_history({}, [])
-    disarms, of_its_time = 4, SimpleNamespace(laws={}, facts={}, summary=dict, progress=dict)
+    disarms, of_its_time = 4, SimpleNamespace(laws={}, facts={}, summarise=dict, report_progress=dict)
 
     def planned(*_: object) -> Any:
         nonlocal disarms

@@ -251,7 +251,8 @@ WRONG: dict[str, tuple[Callable[[DriveBench], None], str, bool]] = {
     "offset of another node": (set_object(0x1401, 1, 0x305), "RPDO2 has the COB-ID 00000305", False),
     "other EDS": (write_other_eds, "choose another profile", False),
     "other profile": (
-        replace_config_text("node_id = 1\n", 'node_id = 1\nprofile = "epos4"\n'), "which profile epos4 is not made for", False),
+        replace_config_text("node_id = 1\n", 'node_id = 1\nprofile = "epos4"\n'),
+        "which profile epos4 is not made for", False),
     "other cycle": (set_object(0x60C2, 1, 1), "it interpolates over 1 ms", False),
     "no heartbeat consumer": (lambda b: remove_object(b.peer, 0x1016), "it has no heartbeat consumer (0x1016)", True),
     "sign of the offset": (set_fault("offset_scale", -1.0), "does not add 0x60B0 to the target", True),

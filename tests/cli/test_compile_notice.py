@@ -34,7 +34,7 @@ def test_cached_kernels_of_numba_are_detected(tmp_path: Path, monkeypatch: pytes
     folder = tmp_path / f"{source.parent.name}_0"
     folder.mkdir()
     version = f"py{sys.version_info.major}{sys.version_info.minor}"
-    made = folder / f"kernels._solve_plain-51.{version}.nbi"
+    made = folder / f"{source.stem}._solve_plain-51.{version}.nbi"
     made.touch()
     assert compilation_notice.is_compiled("fdhil.correction.offset_kernels")
     os.utime(made, (0, 0))  # older than the source: numba recompiles

@@ -88,7 +88,9 @@ def test_commands_with_exit_code_1_require_delivered_answer() -> None:
     for name, command in iterate_commands(cli):
         assert command.callback is not None
         body = inspect.getsource(inspect.unwrap(command.callback))
-        marked = Path(command.callback.__code__.co_filename).name == "cli_errors.py" or "@verdict" in body
+        marked = (
+            Path(command.callback.__code__.co_filename).name == "cli_errors.py" or "@require_delivered_answer" in body
+        )
         answers = inspect.signature(command.callback).return_annotation == "int" or "exit(1)" in body
         assert marked or not answers, name
 

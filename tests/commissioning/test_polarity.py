@@ -30,8 +30,8 @@ def record_jog(weight_nm: float = 0.0, top_mm_s: float = 5.0, way_mm: float = JO
     current = torque / K + 0.05 * noise[0]
     voltage = R * current + K * speed + 0.05 * noise[1]
     return Recording(
-        "X", DT, freeze_array(np.arange(position.size) * DT), freeze_array(voltage), freeze_array(current), freeze_array(speed),
-        freeze_array(position), freeze_array(position), "interval_mean", PITCH, None,
+        "X", DT, freeze_array(np.arange(position.size) * DT), freeze_array(voltage), freeze_array(current),
+        freeze_array(speed), freeze_array(position), freeze_array(position), "interval_mean", PITCH, None,
     )  # fmt: skip
 
 

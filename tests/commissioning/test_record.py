@@ -53,8 +53,8 @@ def test_record_sealed_without_key_is_refused(seal: str, tmp_path: Path) -> None
     """Anyone can recompute the digest; the seal needs the key."""
     path = save_record(RECORD, tmp_path)
     forged = replace(RECORD, watchdog="proven", options={"6007": 0})
-    seals: dict[str, Any] = {"of no key": forged.compute_seal(b""), "of another key": forged.compute_seal(b"k" * 64), "none": None,
-                             "no text": 5, "not ASCII": "\ud800é"}  # fmt: skip
+    seals: dict[str, Any] = {"of no key": forged.compute_seal(b""), "of another key": forged.compute_seal(b"k" * 64),
+                             "none": None, "no text": 5, "not ASCII": "\ud800é"}  # fmt: skip
     path.write_text(json.dumps({"schema": SCHEMA, **asdict(forged), "digest": forged.digest, "seal": seals[seal]}))
     with pytest.raises(StoreError, match="not sealed with this machine's key; commission the axis again"):
         load_record(tmp_path, "X")

@@ -16,8 +16,9 @@ def samples(axis: str, first: int, error_um: float, zero_mm: float = 0.0, rows: 
     demand = zero_mm + 0.01 * tick
     still = freeze_array(np.zeros(rows))
     return AxisSamples(
-        axis=axis, tick=freeze_integers(tick), demand_mm=freeze_array(demand), position_mm=freeze_array(demand - 1e-3 * error_um),
-        offset_mm=still, speed_rad_s=still, current_a=still, voltage_v=None, statusword=freeze_integers(np.zeros(rows)),
+        axis=axis, tick=freeze_integers(tick), demand_mm=freeze_array(demand),
+        position_mm=freeze_array(demand - 1e-3 * error_um), offset_mm=still,
+        speed_rad_s=still, current_a=still, voltage_v=None, statusword=freeze_integers(np.zeros(rows)),
     )  # fmt: skip
 
 

@@ -94,7 +94,7 @@ def test_initial_bus_silence_and_its_end_are_reported() -> None:
 class SensorFailingAtTheEnd:
     """An NC and a sensor whose connections fail while the cancellation closes them."""
 
-    name, axis, samples, lost, connected = "peer", "X", 0, 0, True
+    name, axis, samples, lost, is_connected = "peer", "X", 0, 0, True
 
     def __init__(self) -> None:
         self.asked = 0
@@ -120,7 +120,7 @@ class SensorFailingAtTheEnd:
     def link(self) -> SensorFailingAtTheEnd:
         return self
 
-    def fault_code(self, _: object) -> None:
+    def classify_fault(self, _: object) -> None:
         """Has no effect."""
 
 

@@ -21,6 +21,9 @@ def test_daemon_and_guard_run_without_fleet_extra(module: str) -> None:
 
 def test_uplink_does_not_import_heavy_libraries() -> None:
     """The uplink runs next to an NC: it loads no numeric library."""
-    code = "import sys, fdhil.fleet.record_uplink; print([n for n in ('numba', 'scipy', 'pyarrow', 'can') if n in sys.modules])"
+    code = (
+        "import sys, fdhil.fleet.record_uplink; "
+        "print([n for n in ('numba', 'scipy', 'pyarrow', 'can') if n in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

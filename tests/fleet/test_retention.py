@@ -94,8 +94,8 @@ class TestRetentionInDatabase:
         """Its next record of that month is in records_other and does not prevent a new partition."""
         await store_records(fleet_settings, told[:4])
         apply_policy(fleet_settings)
-        database.execute_query("""INSERT INTO fleet.records SELECT machine, 'late', recorded_at, store, 999, axis, kind, now(),
-            window_name, record FROM fleet.kept WHERE kind = 'parameters' LIMIT 1""")
+        database.execute_query("""INSERT INTO fleet.records SELECT machine, 'late', recorded_at, store, 999, axis, kind,
+            now(), window_name, record FROM fleet.kept WHERE kind = 'parameters' LIMIT 1""")
         await store_records(fleet_settings, [told[4]._replace(stored_at=NOW)])
         assert list_partitions(database) == ["records_other"]
         assert database.execute_query("SELECT count(*) FROM fleet.records") == [(2,)]

@@ -217,4 +217,4 @@ async def _open_socket(app: FastAPI, path: str, headers: list[tuple[bytes, bytes
 
 def test_local_principal_has_empty_name(client_without_users: FastAPI) -> None:
     access = client_without_users.state.context.access
-    assert access.asker(None) == Principal("", "watch")
+    assert access.find_principal(None) == Principal("", "watch")

@@ -114,7 +114,8 @@ def _examine_controller(place: str, bus: CanBus, details: Mapping[str, Any]) -> 
         yield Trouble("BitrateDiffers", place, what, "nodes with different bit rates corrupt each other's frames", mend)
     if (state := str(details.get("state"))) in BAD_STATES:
         what, means = BAD_STATES[state]
-        mend = f"check plugs, wiring, the two terminating resistors and the bit rate, then: {_format_bring_up_command(bus)}"
+        bring_up = _format_bring_up_command(bus)
+        mend = f"check plugs, wiring, the two terminating resistors and the bit rate, then: {bring_up}"
         yield Trouble("BusOff" if state == "BUS-OFF" else "BusPassive", place, f"{bus.channel} {what}", means, mend)
     if details.get("restart_ms") == 0:
         what = f"{bus.channel} does not restart automatically after a bus-off"

@@ -21,7 +21,7 @@ from fdhil.identification import (
     prepare_window,
     solve_two_steps,
 )
-from fdhil.identification.estimators import maximum_likelihood
+from fdhil.identification import estimate as estimate_maximum_likelihood
 from fdhil.pipeline import analyse_window
 from fdhil.records import UNITS, Estimate, Float, Window, WindowOutcome, compute_rms
 from fdhil.report import DISPLAY_UNITS, Table, draw_signals, draw_torque, simulate_speed
@@ -92,7 +92,7 @@ def _identify_drifts() -> Mapping[str, DriftSeries]:
         for name, windows in (
             ("noise-0.1", simulated_drive.add_noise(fast, 0.001, seed)), ("noise-0.5", many[:1]), ("ten-rapids", many),
         ):  # fmt: skip
-            found[name].append(maximum_likelihood.estimate(windows, Identification()))
+            found[name].append(estimate_maximum_likelihood(windows, Identification()))
     return {name: DriftSeries(estimates) for name, estimates in found.items()}
 
 
@@ -203,7 +203,7 @@ def _evaluate_torques() -> Claim:
             0.001,
             round(celsius),
         )[0]
-        found = maximum_likelihood.estimate([window], Identification()).build_parameters()
+        found = estimate_maximum_likelihood([window], Identification()).build_parameters()
         cases.append((f"{celsius:g} °C", window, found))
         cruise.append(found.Cd + found.ft * RAPID_RAD_S)
         speed = simulate_speed(window, found)

@@ -208,7 +208,8 @@ def _find_largest_at_e(scenario: str, values: Float) -> float:
 def _evaluate_drift(number: int, changes: Sequence[tuple[str, float]], label: str) -> Claim:
     mass = changes is MASS
     trials = [
-        Trial(name, "largest distance of the two paths at E", _find_largest_at_e(name, compute_distance_um(name, changes)), "um",
+        Trial(name, "largest distance of the two paths at E",
+              _find_largest_at_e(name, compute_distance_um(name, changes)), "um",
               **({"least": 10.0} if mass else {"least": 1.0, "most": 10.0}))
         for name in DEMANDED
     ]  # fmt: skip

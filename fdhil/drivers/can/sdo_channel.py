@@ -76,7 +76,10 @@ class SdoChannel:
                 raise
             first, second = self._upload_object(index, sub), self._upload_object(index, sub)
             if first != second:
-                text = f"{_format_object(index, sub)} gave two answers after a time-out; check that only one master sends requests"
+                text = (
+                    f"{_format_object(index, sub)} gave two answers after a time-out; "
+                    "check that only one master sends requests"
+                )
                 raise ProtocolError(self.device, text) from None
             return second
 
@@ -131,7 +134,10 @@ class SdoChannel:
                     text = f"{_format_object(index, sub)} was not finished after {DEADLINE_S:g} s; check the bus load"
                     raise SdoTooLarge(self.device, text)
             self._client.abort(_MEMORY_ABORT)
-        text = f"{_format_object(index, sub)} is longer than {MAX_BYTES} bytes; no object of a working drive is; check the drive"
+        text = (
+            f"{_format_object(index, sub)} is longer than {MAX_BYTES} bytes; "
+            "no object of a working drive is; check the drive"
+        )
         raise SdoTooLarge(self.device, text)
 
     def _translate_errors(self, index: int, sub: int, call: Any) -> Any:

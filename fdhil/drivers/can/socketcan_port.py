@@ -65,7 +65,8 @@ class SocketCanPort:
                 raise OSError(errno.ENETDOWN, "it is down")
         except OSError as error:
             self._socket.close()
-            text = f"the CAN interface {settings.channel} cannot be opened ({error.strerror}); {_advise_on_error(error, settings)}"
+            advice = _advise_on_error(error, settings)
+            text = f"the CAN interface {settings.channel} cannot be opened ({error.strerror}); {advice}"
             raise ConnectError(name, text) from None
 
     def _configure_socket(self, filters: Sequence[Filter]) -> None:

@@ -159,7 +159,10 @@ def _assess_voltage(device: DeviceDescription, profile: DriveProfile) -> Capabil
         if not profile.duty_per_count:
             return Capability(what, "yes", f"{format_key(keys[0])} is the terminal voltage")
         link = f"the DC link ({format_key(keys[1])})" if len(keys) > 1 else "drive.dc_link_v"
-        why = f"{format_key(keys[0])} (duty) times {link}: without dead time and drops of the stage, R comes out too large"
+        why = (
+            f"{format_key(keys[0])} (duty) times {link}: "
+            "without dead time and drops of the stage, R comes out too large"
+        )
         return Capability(what, "yes", why, "check it once against a meter")
     if profile.voltage is not None:
         why = (

@@ -58,7 +58,10 @@ class OpcUaSource:
             raise ConnectError(self.name, text) from None
         except LOST as error:
             await self._disconnect()
-            text = f"cannot be connected ({_shorten_error(error)}); compare url, user, certificate and the server's own settings"
+            text = (
+                f"cannot be connected ({_shorten_error(error)}); "
+                "compare url, user, certificate and the server's own settings"
+            )
             raise ConnectError(self.name, text) from None
         except NONSENSE as error:
             await self._disconnect()

@@ -70,7 +70,8 @@ def test_servo_with_position_offset_can_be_corrected(tmp_path: Path) -> None:
 
 CASES: dict[str, tuple[tuple[Variable, ...], str, str, str]] = {
     "no offset": (remove_objects(SERVO, 0x60B0), "correct on line", "no", "no position offset (60B0)"),
-    "offset for no PDO": (change_objects(SERVO, 0x60B0, "rw", 0), "correct on line", "no", "no RPDO can carry its 60B0"),
+    "offset for no PDO": (change_objects(SERVO, 0x60B0, "rw", 0), "correct on line", "no",
+                         "no RPDO can carry its 60B0"),
     "offset for RPDOs": (change_objects(SERVO, 0x60B0, "rww"), "correct on line", "perhaps", "only a test on the "
                                                                                              "drive shows"),
     "mode not shown": (change_objects(SERVO, 0x6061, "ro", 0), "correct on line", "no", "no TPDO shows its 6061:00"),

@@ -146,7 +146,7 @@ def build_arc(motion: Arc, start: Point) -> ArcShape:
         return (place[0], place[1], place[2])
 
     return ArcShape(
-        centre=place_in_axes(x, y, start[normal]), u=place_in_axes(c, s, 0.0), v=place_in_axes(-s * sense, c * sense, 0.0),
-        radius=radius, growth=last - radius, angle=abs(path.angle_rad), rise=place_in_axes(0.0, 0.0, path.rise_mm),
-        length=path.length_mm,
+        centre=place_in_axes(x, y, start[normal]), u=place_in_axes(c, s, 0.0),
+        v=place_in_axes(-s * sense, c * sense, 0.0), radius=radius, growth=last - radius, angle=abs(path.angle_rad),
+        rise=place_in_axes(0.0, 0.0, path.rise_mm), length=path.length_mm,
     )  # fmt: skip
