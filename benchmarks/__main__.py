@@ -42,7 +42,7 @@ BENCHMARKS = {
 def run(name: str, options: Sequence[str] = ()) -> dict[str, Any]:
     """Run one benchmark and return what it printed, and what it ran on; a failing one ends the run."""
     print(f"{name}: {BENCHMARKS[name]} ...", flush=True)
-    told = describe_provenance(" ".join([f"python -m benchmarks.{name}", *options])) | {
+    reported = describe_provenance(" ".join([f"python -m benchmarks.{name}", *options])) | {
         "host": f"{platform.machine()}, {os.cpu_count()} cores"
     }
     done = subprocess.run(
@@ -52,7 +52,7 @@ def run(name: str, options: Sequence[str] = ()) -> dict[str, Any]:
     if done.returncode != 0:
         print(done.stderr, file=sys.stderr)
         sys.exit(f"benchmark {name} failed")
-    return {"run": told, "output": done.stdout.strip().splitlines()}
+    return {"run": reported, "output": done.stdout.strip().splitlines()}
 
 
 def page(figures: Mapping[str, Any]) -> str:
@@ -64,9 +64,9 @@ def page(figures: Mapping[str, Any]) -> str:
     )
     for name, title in BENCHMARKS.items():
         if name in figures:
-            told = figures[name]["run"]
-            where = f"{told['date']}, commit {told['commit']}, {told['versions']}, {told['host']}."
-            lines += [f"## {title}", "", *wrap_paragraph(f"`{told['command']}`, {where}")]
+            reported = figures[name]["run"]
+            where = f"{reported['date']}, commit {reported['commit']}, {reported['versions']}, {reported['host']}."
+            lines += [f"## {title}", "", *wrap_paragraph(f"`{reported['command']}`, {where}")]
             lines += ["```text", *figures[name]["output"], "```", ""]
     return "\n".join(lines).rstrip() + "\n"
 

@@ -40,18 +40,18 @@ def send(write: Write, rate_hz: int, frames: int) -> None:
 def listen(bus: Bus, write: Write, rate_hz: int, frames: int) -> str:
     """Hear what is sent; return a line of the table."""
     sender = mp.get_context("fork").Process(target=send, args=(write, rate_hz, frames), daemon=True)
-    late_ms, heard, cpu_s, quiet_s = [], 0, time.process_time(), time.monotonic() + 5.0
+    late_ms, received, cpu_s, quiet_s = [], 0, time.process_time(), time.monotonic() + 5.0
     sender.start()
-    while heard < frames and time.monotonic() < quiet_s:
+    while received < frames and time.monotonic() < quiet_s:
         time.sleep(DRAIN_S)
         block = bus.drain_frames()
         if block.size:
             late_ms.append((block["t_ns"] - block["data"].astype(np.int64)) * 1e-6)
-            heard, quiet_s = heard + block.size, time.monotonic() + 2.0
+            received, quiet_s = received + block.size, time.monotonic() + 2.0
     cpu_s = time.process_time() - cpu_s
     sender.join()
     median, worst = np.percentile(np.concatenate(late_ms), [50, 99])
-    return f"{rate_hz:>10}{1e6 * cpu_s / heard:>10.1f}{median:>12.2f}{worst:>12.2f}{frames - heard:>6}"
+    return f"{rate_hz:>10}{1e6 * cpu_s / received:>10.1f}{median:>12.2f}{worst:>12.2f}{frames - received:>6}"
 
 
 def slcan(rate_hz: int, frames: int) -> str:

@@ -52,11 +52,11 @@ class Way:
 
     def line(self, ours: Way) -> str:
         """Return it in words, beside ours."""
-        told = f"{self.records_a_s:8.0f} records/s, {self.processor_us:5.1f} us of processor each: {self.name}"
+        reported = f"{self.records_a_s:8.0f} records/s, {self.processor_us:5.1f} us of processor each: {self.name}"
         if self is ours:
-            return told
+            return reported
         used = self.processor_us / ours.processor_us
-        return f"{told}; ours beside it {ours.records_a_s / self.records_a_s:.2f} (by processor {used:.2f})"
+        return f"{reported}; ours beside it {ours.records_a_s / self.records_a_s:.2f} (by processor {used:.2f})"
 
 
 @dataclass
@@ -181,8 +181,8 @@ def batch_messages(senders: Sequence[OutboxSender]) -> list[Message]:
 
 def convert_to_rows(messages: Sequence[Message]) -> list[str]:
     """Return what is in messages as a database takes it."""
-    told = [told for message in messages for told in decode_message(message.subject, message.payload)]
-    return list(_format_copy_rows([(record, LISTED) for record in told if isinstance(record, Record)]))
+    reported = [told for message in messages for told in decode_message(message.subject, message.payload)]
+    return list(_format_copy_rows([(record, LISTED) for record in reported if isinstance(record, Record)]))
 
 
 async def publish(client: Client, messages: Sequence[Message]) -> None:

@@ -60,16 +60,16 @@ def measure(folder: Path, windows: int, method: str, database: Postgres) -> None
         with open_database(fleet) as db:
             db.execute("TRUNCATE fleet.reanalyses CASCADE")
         begin_s = time.perf_counter()
-        with open_worker_pool(None, count) as crew:
+        with open_worker_pool(None, count) as pool:
             up_s = time.perf_counter() - begin_s
-            revision = reanalysis.reanalyse_windows(fleet, asked, reanalysis.WindowScope(), crew)
+            revision = reanalysis.reanalyse_windows(fleet, asked, reanalysis.WindowScope(), pool)
             took_s = time.perf_counter() - begin_s - up_s
         with open_read_only(fleet) as db:
             begin_s = time.perf_counter()
-            told = summarise_changes(db, revision, "type")
+            reported = summarise_changes(db, revision, "type")
             asked_s = time.perf_counter() - begin_s
-        assert told["windows"] == windows
-        digests.add(told["digest"])
+        assert reported["windows"] == windows
+        digests.add(reported["digest"])
         rates.setdefault(count, []).append(windows / took_s)
         print(f"{count} workers: up in {up_s:.1f} s, {took_s:.1f} s, the report {asked_s:.2f} s", flush=True)
     assert len(digests) == 1
@@ -100,8 +100,8 @@ async def gather_windows(fleet: Fleet, windows: int) -> int:
             at = BEGIN + timedelta(seconds=k)
             row = (f"mill-{k % 10}", name, at, "0" * 32, k, "X", "window", at, name, Jsonb(record))
             await db.execute(f"INSERT INTO fleet.records VALUES ({', '.join(['%s'] * len(row))})", row)
-            heard = "INSERT INTO fleet.heard VALUES (%s, 'of', 1, 1, %s, %s) ON CONFLICT DO NOTHING"
-            await db.execute(heard, (row[0], at, at))
+            received = "INSERT INTO fleet.heard VALUES (%s, 'of', 1, 1, %s, %s) ON CONFLICT DO NOTHING"
+            await db.execute(received, (row[0], at, at))
     return size
 
 

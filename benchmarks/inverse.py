@@ -189,11 +189,11 @@ def _print_lags() -> None:
         correction = plan_correction(
             build_trajectory(build_bench_demand(feed)), MODELS, change_config(speed_feedforward=feedforward), "inverse"
         )
-        said = "; ".join(f"{r.code}: {r.text}; {r.advice}" for r in correction.refused[:1])
+        message = "; ".join(f"{r.code}: {r.text}; {r.advice}" for r in correction.refused[:1])
         left = (
             f"{compute_rms(correction.before.contour_um):.1f} -> {compute_rms(correction.after.contour_um):.2f} um RMS"
         )
-        print(f"Kff {feedforward:.1f}, {feed:4.1f} m/min: {said or left}")
+        print(f"Kff {feedforward:.1f}, {feed:4.1f} m/min: {message or left}")
 
 
 def main() -> None:

@@ -73,12 +73,12 @@ def compare_with_linuxcnc(nc: DemandRecorder) -> None:
         for mode, feed in product(("G61", "G64 P0.05", "G64 P0.2 Q0.02"), (6000.0, 20000.0)):
             text = build_program(path, mode, feed)
             b = nc.record_demand(text)
-            told = []
+            reported = []
             for profile in ("linuxcnc", "trapezoidal"):
                 share = EXACT_SHARE if mode == "G61" and profile == "trapezoidal" else 1.0
                 a = plan_demand(text, ACCELERATION_MM_S2 * share, profile)
-                told.append(f"{profile} {100 * (len(a) / len(b) - 1):+.2f} %, {measure_distance_mm(a, b):.3f} mm")
-            print(f"{path}, {mode}, {feed / 1000:g} m/min: {len(b)}; {'; '.join(told)}")
+                reported.append(f"{profile} {100 * (len(a) / len(b) - 1):+.2f} %, {measure_distance_mm(a, b):.3f} mm")
+            print(f"{path}, {mode}, {feed / 1000:g} m/min: {len(b)}; {'; '.join(reported)}")
 
 
 def make_jerky_demands(nc: DemandRecorder | None) -> Iterator[tuple[str, Float]]:

@@ -81,8 +81,8 @@ def play(path: Path, program: Path) -> dict[str, Any]:
     done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=False)
     if done.returncode not in (0, 1):
         sys.exit(done.stdout + done.stderr)
-    said: dict[str, Any] = json.loads(done.stdout)
-    return said
+    message: dict[str, Any] = json.loads(done.stdout)
+    return message
 
 
 def main() -> None:
@@ -100,14 +100,14 @@ def main() -> None:
         program = folder / "circle.csv"
         demand(program, given.seconds, given.period_ms)
         with machine(folder, given.period_ms, given.interface, given.lockstep) as path:
-            said = play(path, program)
-        if "refused" in said:
-            sys.exit(said["refused"])
-        sync = said["sync"]
+            message = play(path, program)
+        if "refused" in message:
+            sys.exit(message["refused"])
+        sync = message["sync"]
         print(
             f"fdhil play: {sync['late_p50_us']:.0f} {sync['late_p99_us']:.0f} {sync['late_max_us']:.0f} "
             f"{sync['scheduling']} (p50 p99 max, us); {sync['skipped']} of {sync['cycles']} periods missed; "
-            f"{said['played']} of {said['rows']} rows, stopped: {said['stopped']}"
+            f"{message['played']} of {message['rows']} rows, stopped: {message['stopped']}"
         )
 
 

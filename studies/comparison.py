@@ -124,10 +124,10 @@ def compare(runs: int, processes: int) -> list[Figures]:
     cases = list(product(PERIODS_S, NOISES))
     firsts = range(0, runs, CHUNK)
     with ProcessPoolExecutor(processes) as executor:
-        told = {case: list(executor.map(partial(run_chunk, case), firsts)) for case in cases}
+        reported = {case: list(executor.map(partial(run_chunk, case), firsts)) for case in cases}
     return [
         summarise_case(case, *(np.concatenate([part[k] for part in parts]) for k in (0, 1)))
-        for case, parts in told.items()
+        for case, parts in reported.items()
     ]
 
 

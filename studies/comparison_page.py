@@ -121,11 +121,11 @@ def _describe_best_operator(name: str, first: Array, found: Sequence[Figures]) -
         if not k
     ]
     others = Counter(SHORT[PAPER_OPERATORS[k]].removeprefix("LS, ") for k in first if k)
-    told = [f"at {join_words(where)}"] if 0 < won < len(found) else []
-    told += (
+    reported = [f"at {join_words(where)}"] if 0 < won < len(found) else []
+    reported += (
         [f"otherwise {join_words([f'{other} in {count}' for other, count in others.most_common()])}"] if others else []
     )
-    place = f" ({'; '.join(told)})" if told else ""
+    place = f" ({'; '.join(reported)})" if reported else ""
     return f"{describe_filter(name)} {format_share(won, len(found))} cases{place}"
 
 
@@ -190,8 +190,8 @@ def _compare_same_filter(found: Sequence[Figures], names: Names) -> list[str]:
         Jt is {join_words(growth)} % off as the noise grows."""
     )
     columns = ["noise %", "low-pass", *parameters]
-    told = "Bias of zero forcing #1 at a period of 1 ms, % of the true value (RMS error):"
-    return [*lines, told, "", *write_table(columns, rows), ""]
+    reported = "Bias of zero forcing #1 at a period of 1 ms, % of the true value (RMS error):"
+    return [*lines, reported, "", *write_table(columns, rows), ""]
 
 
 def _describe_unbiased(bias: Array, parameters: Sequence[str]) -> str:
@@ -247,8 +247,8 @@ def _describe_instrument_cost(found: Sequence[Figures], names: Names) -> str:
     iv, ml = methods.index("instrumental_variables"), methods.index("maximum_likelihood")
     pair = [parameters.index("ft"), parameters.index("Cd")]
     times = [np.median([f.rms[k, iv, pair] / f.rms[k, ml, pair] for f in found]) for k in range(len(filters))]
-    told = join_words([f"{t:.1f} times {describe_filter(name)}" for t, name in zip(times, filters, strict=True)])
-    return f"In ft and Cd their RMS error is, beside the likelihood's, {told} (median)."
+    reported = join_words([f"{t:.1f} times {describe_filter(name)}" for t, name in zip(times, filters, strict=True)])
+    return f"In ft and Cd their RMS error is, beside the likelihood's, {reported} (median)."
 
 
 def _build_table(f: Figures, names: Names) -> list[str]:
@@ -314,9 +314,9 @@ def _draw_lines(panel: Any, at: Sequence[float], values: Callable[[int], Any], m
     """Draw one line per method; those that the product offers are bold."""
     bold = {"zero_forcing_1", "partial_moments", "instrumental_variables", "maximum_likelihood"}
     for m, name in enumerate(methods):
-        told = (
+        reported = (
             {"linewidth": 2.2, "marker": "o"} if name in bold else {"linewidth": 1.0, "marker": ".", "linestyle": "--"}
         )
-        panel.plot(at, values(m), label=SHORT[name], color=f"C{m}", **told)
+        panel.plot(at, values(m), label=SHORT[name], color=f"C{m}", **reported)
     panel.set_yscale("log")
     panel.grid(True, which="major", alpha=0.3)

@@ -53,10 +53,10 @@ def fill_disks(options: argparse.Namespace, folder: Path) -> Found:
         for free in (*FREE_BYTES, None):
             place = folder / f"{name} {free}"
             place.mkdir()
-            told = small_disks.read_only(make, place) if free is None else small_disks.filled(make, place, free)
-            kept, refused = kept + len(told.kept), refused + len(told.refused)
-            lost = set(told.kept) - set(told.found) - {small_disks.LATER}
-            wrong += [*told.wrong, *(f"{free} bytes free: {number} is lost" for number in sorted(lost))]
+            reported = small_disks.read_only(make, place) if free is None else small_disks.filled(make, place, free)
+            kept, refused = kept + len(reported.kept), refused + len(reported.refused)
+            lost = set(reported.kept) - set(reported.found) - {small_disks.LATER}
+            wrong += [*reported.wrong, *(f"{free} bytes free: {number} is lost" for number in sorted(lost))]
         yield name, {"disks": len(FREE_BYTES) + 1, "acknowledged": kept, "refused": refused, "wrong": wrong[:MOST_TOLD]}
 
 

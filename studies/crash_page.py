@@ -56,8 +56,8 @@ def page(run: pages.Run, figures: Figures) -> str:
             part."""
         ),
     ]
-    for goal, told in figures["goals"].items():
-        lines += pages.wrap_paragraph(f"Goal {goal}, {'met' if told['met'] else 'not met'}: {told['figure']}.")
+    for goal, reported in figures["goals"].items():
+        lines += pages.wrap_paragraph(f"Goal {goal}, {'met' if reported['met'] else 'not met'}: {reported['figure']}.")
     for part, write in (
         ("calls", _describe_calls),
         ("cuts", _describe_power_cuts),
@@ -71,8 +71,8 @@ def page(run: pages.Run, figures: Figures) -> str:
 
 def _describe_measurement(found: Figures) -> list[str]:
     """Return when and with which code a part was measured."""
-    told = sorted({f"{one['date']} at commit {one['commit']}" for one in found.values()})
-    return pages.wrap_paragraph(f"Measured on {pages.join_words(told)}.")
+    reported = sorted({f"{one['date']} at commit {one['commit']}" for one in found.values()})
+    return pages.wrap_paragraph(f"Measured on {pages.join_words(reported)}.")
 
 
 def _describe_calls(kinds: Figures) -> list[str]:

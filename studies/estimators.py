@@ -113,8 +113,8 @@ def run_monte_carlo(method: Method, recording: Recording, noise: float, runs: in
         estimate = method(add_white_noise(recording, noise, seed))
         errors.append(estimate.values / TRUTH - 1)
         inside.append(np.abs(estimate.values - TRUTH) <= 1.96 * np.sqrt(np.diag(estimate.covariance)))
-    told = np.array(errors)
-    return told.mean(axis=0), np.sqrt((told**2).mean(axis=0)), np.mean(inside, axis=0)
+    reported = np.array(errors)
+    return reported.mean(axis=0), np.sqrt((reported**2).mean(axis=0)), np.mean(inside, axis=0)
 
 
 def measure(runs: int) -> dict[str, Any]:
@@ -122,8 +122,8 @@ def measure(runs: int) -> dict[str, Any]:
     recording = record_clean_rapid()
     found = []
     for noise in NOISES:
-        told = {name: run_monte_carlo(method, recording, noise, runs) for name, method in list_methods().items()}
-        rows = {name: dict(zip(("bias", "rms", "share"), figures, strict=True)) for name, figures in told.items()}
+        reported = {name: run_monte_carlo(method, recording, noise, runs) for name, method in list_methods().items()}
+        rows = {name: dict(zip(("bias", "rms", "share"), figures, strict=True)) for name, figures in reported.items()}
         found.append({"noise": noise, "bound": compute_bound(recording, noise) / TRUTH, "methods": rows})
     return {
         "runs": runs,
@@ -146,8 +146,10 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         ]
         lines += ["RMS error over the bound (bias in % of the truth; share of 95 % intervals that hold the truth)", ""]
         rows = [["bound, %", *(f"{100 * x:.3f}" for x in limit)]]
-        for name, told in part["methods"].items():
-            told_ = zip(ratios[name], _format_numbers(told["bias"]), _format_numbers(told["share"]), strict=True)
+        for name, reported in part["methods"].items():
+            told_ = zip(
+                ratios[name], _format_numbers(reported["bias"]), _format_numbers(reported["share"]), strict=True
+            )
             rows.append([name, *(_format_cell(*one) for one in told_)])
         lines += [*pages.write_table(["method", *PARAMETERS], rows), ""]
     lines += ["![RMS error over the bound](estimators.svg)", ""]
@@ -219,8 +221,8 @@ def draw(figures: Mapping[str, Any], path: Path) -> None:
     part = figures["noises"][0]
     drawing = Figure(figsize=(9, 4.5), layout="constrained")
     axes = drawing.subplots()
-    for k, (name, told) in enumerate(part["methods"].items()):
-        axes.plot(range(6), _compute_ratios(told, np.array(part["bound"])), marker="o", label=name, zorder=2 + k)
+    for k, (name, reported) in enumerate(part["methods"].items()):
+        axes.plot(range(6), _compute_ratios(reported, np.array(part["bound"])), marker="o", label=name, zorder=2 + k)
     axes.axhline(1.0, color="black", linewidth=0.8)
     axes.set_yscale("log")
     axes.set_xticks(range(6), PARAMETERS)

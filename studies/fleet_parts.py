@@ -64,9 +64,9 @@ def measure_database_s(database: Postgres) -> float:
 def kill_database(database: Postgres) -> None:
     """Kill PostgreSQL and all that it has started, with SIGKILL."""
     assert database._process is not None
-    told = subprocess.run(["pgrep", "-P", str(database._process.pid)], capture_output=True, text=True, check=False)
+    reported = subprocess.run(["pgrep", "-P", str(database._process.pid)], capture_output=True, text=True, check=False)
     database._process.send_signal(signal.SIGSTOP)  # else it would start some again
-    for pid in [*map(int, told.stdout.split()), database._process.pid]:
+    for pid in [*map(int, reported.stdout.split()), database._process.pid]:
         try:
             os.kill(pid, signal.SIGKILL)
         except ProcessLookupError:

@@ -54,8 +54,8 @@ def measure(options: argparse.Namespace) -> Figures:
     letters = before.get("slips")
     if letters is None or (not letters["all"] and (options.slips == 0 or options.slips > letters["count"])):
         letters = assess_slips(options.slips, options.seed)
-    told = {name: parts[name] for name in TARGETS if name in parts}
-    figures = {"targets": told, "mended": load_fixed_inputs(), "slips": letters}
+    reported = {name: parts[name] for name in TARGETS if name in parts}
+    figures = {"targets": reported, "mended": load_fixed_inputs(), "slips": letters}
     return {**figures, "goals": evaluate_goals(figures)}
 
 
@@ -71,10 +71,10 @@ def fuzz_target(name: str, inputs: int, seconds: float, seed: int) -> Figures:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
     if lines:
-        said: Figures = json.loads(lines[-1])
-        if said["found"]:
+        message: Figures = json.loads(lines[-1])
+        if message["found"]:
             print(done.stderr[-4000:], file=sys.stderr)
-        return said
+        return message
     print(done.stderr[-4000:], file=sys.stderr)
     ended = {"kind": f"the process ended with {done.returncode}", "place": name, "inputs": 1}
     return {"target": name, "inputs": 0, "cpu_s": 0.0, "slowest_s": 0.0, "peak_mib": 0.0, "found": [ended]}
@@ -142,8 +142,8 @@ def page(run: Mapping[str, str], figures: Mapping[str, Any]) -> str:
         became another number which a machine may have cannot be told from what was meant; that nothing but the mistyped
         key changes can. {"Nothing else changed." if letters["met"] else "Wrong: " + join_words(letters["wrong"])}"""
     )
-    told = [(words, f"{letters['outcomes'].get(key, 0):,}") for key, words in slips.OUTCOMES.items()]
-    lines += write_table(("what became of it", "slips"), told)
+    reported = [(words, f"{letters['outcomes'].get(key, 0):,}") for key, words in slips.OUTCOMES.items()]
+    lines += write_table(("what became of it", "slips"), reported)
     return "\n".join(lines)
 
 

@@ -354,10 +354,10 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Return what happened how often, and the frames that broke a limit."""
     seen, wrong = walks(options.sync, options.seed, options.processes)
     met = not wrong and seen["sync"] >= 10_000_000
-    told = (
+    reported = (
         f"{len(wrong)} in {seen['sync']:,} SYNC of two axes at random ({seen['frames'] + seen['fed frames']:,} frames)"
     )
-    goals = {"R3": {"met": met, "figure": told}}
+    goals = {"R3": {"met": met, "figure": reported}}
     return {"counts": dict(sorted(seen.items())), "violations": wrong, "goals": goals}
 
 

@@ -73,5 +73,5 @@ def measure_path_error_um(models: Sequence[Parameters], scene: Scene) -> list[st
 
 
 def _compute_missed_torque(model: Parameters, axis: Axis, demand_mm: Float, position_mm: Float) -> tuple[float, float]:
-    told = closed_loop.simulate_axis(model, axis, drives.CYCLE_S, demand_mm).position_mm
-    return 1e3 * compute_rms(position_mm - told), 1e3 * compute_rms(position_mm - demand_mm)
+    reported = closed_loop.simulate_axis(model, axis, drives.CYCLE_S, demand_mm).position_mm
+    return 1e3 * compute_rms(position_mm - reported), 1e3 * compute_rms(position_mm - demand_mm)

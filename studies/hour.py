@@ -116,7 +116,7 @@ def write_simulator_config(folder: Path) -> Path:
 def write_answers(folder: Path, twin: SimulatorProcess, port: int) -> dict[str, str]:
     """Write the answers from the data sheets; return each with its source."""
     sheet = load_machine_document()["axis"]
-    told: dict[str, Any] = {
+    reported: dict[str, Any] = {
         "bus": {name: dict(bus) for name, bus in twin.ready["buses"].items()},
         "g0": {"source": "linuxcnc"},
         "nc_source": {"linuxcnc": {"port": port}},
@@ -131,12 +131,12 @@ def write_answers(folder: Path, twin: SimulatorProcess, port: int) -> dict[str, 
     for axis, from_sheet in sheet.items():
         for path, where in WHERE.items():
             *tables, key = path.split(".")
-            source, target = from_sheet, told.setdefault("axis", {}).setdefault(axis, {})
+            source, target = from_sheet, reported.setdefault("axis", {}).setdefault(axis, {})
             for name in tables:
                 source, target = source[name], target.setdefault(name, {})
             target[key] = source[key]
             known[f"axis.{axis}.{path}"] = where
-    (folder / "answers.toml").write_text(format_toml(told))
+    (folder / "answers.toml").write_text(format_toml(reported))
     return known
 
 

@@ -71,7 +71,7 @@ class Tally:
 
 
 def assess_recording(
-    kind: str, seed: int, spoilt: faults.FaultyRecording, scene: Scene | None = None, *, configured: bool = False
+    kind: str, seed: int, corrupted: faults.FaultyRecording, scene: Scene | None = None, *, configured: bool = False
 ) -> Judged:
     """Return the validation's verdict of one recording, ``configured`` with the machine's section.
 
@@ -79,32 +79,34 @@ def assess_recording(
     """
     settings = Identification()
     axis = harm.make_axis(scene) if configured and scene is not None else None
-    outcomes = [analyse_window(window, settings, axis, drives.CYCLE_S) for window in find_windows(spoilt.recording)]
+    outcomes = [analyse_window(window, settings, axis, drives.CYCLE_S) for window in find_windows(corrupted.recording)]
     _, verdict = pool_windows(outcomes, settings)
     reasons = [reason for outcome in outcomes for reason in outcome.verdict.reasons] + list(verdict.reasons)
     refused = sum(not outcome.verdict.accepted for outcome in outcomes)
     # what differs between two rapids is seen where both are believed
     alone = kind in faults.BETWEEN and refused > 0
-    told = [o.estimate for o in outcomes if o.verdict.accepted and o.estimate is not None]
+    reported = [o.estimate for o in outcomes if o.verdict.accepted and o.estimate is not None]
     return Judged(
         seed,
         kind,
-        spoilt.severity,
+        corrupted.severity,
         len(outcomes),
         refused,
         verdict.accepted and not alone,
         codes=tuple(sorted({reason.code for reason in reasons})),
         texts=tuple(dict.fromkeys(str(reason) for reason in reasons)),
-        left_open=tuple(" and ".join(estimate.missing) for estimate in told if estimate.missing),
-        harm=() if scene is None or kind in faults.BETWEEN else _measure_harm(outcomes, spoilt.scene or scene),
+        left_open=tuple(" and ".join(estimate.missing) for estimate in reported if estimate.missing),
+        harm=() if scene is None or kind in faults.BETWEEN else _measure_harm(outcomes, corrupted.scene or scene),
         warned=tuple(sorted({warning.code for o in outcomes for warning in o.verdict.warnings})),
     )
 
 
 def _measure_harm(outcomes: Iterable[WindowOutcome], scene: Scene) -> tuple[str, ...]:
-    told = [o.estimate for o in outcomes if o.verdict.accepted and o.estimate is not None]
-    wrong = [text for estimate in told for text in harm.find_deviating_parameters(estimate, scene.drive)]
-    models = [p for p in (estimate.build_parameters() for estimate in told) if math.isfinite(sum(p.as_dict().values()))]
+    reported = [o.estimate for o in outcomes if o.verdict.accepted and o.estimate is not None]
+    wrong = [text for estimate in reported for text in harm.find_deviating_parameters(estimate, scene.drive)]
+    models = [
+        p for p in (estimate.build_parameters() for estimate in reported) if math.isfinite(sum(p.as_dict().values()))
+    ]
     return (*wrong, *(harm.measure_path_error_um(models, scene) if models else ()))
 
 
@@ -200,8 +202,8 @@ def _find_worst_kinds(counted: Mapping[str, Tally], kinds: Mapping[str, faults.K
     """Name the kinds with the lowest rate of correct names."""
     shares = {name: counted[name].right / counted[name].count for name in kinds if counted[name].count}
     least = sorted((name for name, share in shares.items() if share < NAMED), key=shares.__getitem__)
-    told = [f"{name} ({shares[name]:.0%})" for name in least]
-    return f"Named rightly in less than {NAMED:.0%}: {', '.join(told) or 'no kind'}."
+    reported = [f"{name} ({shares[name]:.0%})" for name in least]
+    return f"Named rightly in less than {NAMED:.0%}: {', '.join(reported) or 'no kind'}."
 
 
 def _format_percent(part: int, whole: int) -> str:

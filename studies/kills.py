@@ -46,9 +46,9 @@ def run_until_idle(live: LiveGuard, of: Row, row: str, rate: int, found: Found) 
     found.descents.setdefault(row, []).append(way)
     if way is None or not way.within or any(live.read_held_offsets()):
         found.wrong.append(f"{row}: from {start} to {series[-1]} by {way}, the drives hold {live.read_held_offsets()}")
-    told = {event["code"] for event in live.events[seen:] if event.get("code")}
-    if of.code not in told:
-        found.wrong.append(f"{row} was told as {sorted(told)}")
+    reported = {event["code"] for event in live.events[seen:] if event.get("code")}
+    if of.code not in reported:
+        found.wrong.append(f"{row} was told as {sorted(reported)}")
     if live.has_journal_state(
         "FROZEN", seen
     ):  # a guard that digests a long hang sees its zeros too late to know of them
@@ -172,8 +172,10 @@ def restart_guard(live: LiveGuard, stale: str, found: Found) -> None:
         live.read_held_offsets()
     )
     if not good:
-        told = [(event["state"], event.get("text", "")) for event in live.events[seen:] if "state" in event]
-        found.wrong.append(f"{stale}: {holds} became {live.read_held_offsets()} by {live.sent - before} frames, {told}")
+        reported = [(event["state"], event.get("text", "")) for event in live.events[seen:] if "state" in event]
+        found.wrong.append(
+            f"{stale}: {holds} became {live.read_held_offsets()} by {live.sent - before} frames, {reported}"
+        )
     found.counts[stale] += 1
     found.counts["good"] += good
     frozen = live.has_journal_state("FROZEN", seen)

@@ -170,8 +170,8 @@ def _format_line(row: str, of: Mapping[str, Any]) -> list[str]:
     whole = [max(level[key] for level in levels) if levels else "" for key in ("shrinking_worst", "zero_worst")]
     middle = of["decisions"].get("zero_median", "")
     trials = sum(of[level]["trials"] for level in of)
-    told = (row, ROWS[row].fault, f"`{RAMPED[row].code}`", RAMPED[row].detected, whole[0], middle, whole[1])
-    return [*map(str, told), f"{trials:,}", str(of["processes"]["trials"] or "")]
+    reported = (row, ROWS[row].fault, f"`{RAMPED[row].code}`", RAMPED[row].detected, whole[0], middle, whole[1])
+    return [*map(str, reported), f"{trials:,}", str(of["processes"]["trials"] or "")]
 
 
 COLUMNS = (

@@ -149,8 +149,8 @@ class Node:
     def send(self, _can_id: int, data: bytes) -> None:
         """Answer an expedited upload; an abort has no answer."""
         if data[0] == 0x40:
-            told = b"\x43" + data[1:4] + struct.pack("<I", self.question)
-            self._deliver(self._faults.process_frame((0x581, told), "received", self.now_s))
+            reported = b"\x43" + data[1:4] + struct.pack("<I", self.question)
+            self._deliver(self._faults.process_frame((0x581, reported), "received", self.now_s))
 
     def _deliver(self, passed: list[Any]) -> None:
         assert self.link is not None

@@ -167,11 +167,11 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
 
 
 def _format_shares(modules: Mapping[str, Any]) -> list[str]:
-    told = []
+    reported = []
     for kind in ("code", "values"):
         noticed, total = sum_detected(modules, kind)
-        told += [f"{total:,}", f"{noticed:,}", f"{100 * noticed / total:.1f}"] if total else ["0", "", ""]
-    return told
+        reported += [f"{total:,}", f"{noticed:,}", f"{100 * noticed / total:.1f}"] if total else ["0", "", ""]
+    return reported
 
 
 def _list_survivors(rows: Sequence[Mapping[str, str]]) -> list[str]:

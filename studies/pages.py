@@ -60,12 +60,12 @@ def _list_given_options(value: Any) -> str:
 
 def describe_provenance(command: str) -> dict[str, str]:
     """Return what a reader needs to measure the same again: command, commit, versions; and the day."""
-    told = {"Python": platform.python_version()} | {name: version(name) for name in ("numpy", "scipy", "numba")}
+    reported = {"Python": platform.python_version()} | {name: version(name) for name in ("numpy", "scipy", "numba")}
     return {
         "command": command,
         "commit": read_commit(),
         "date": f"{datetime.now(UTC):%Y-%m-%d}",
-        "versions": ", ".join(f"{name} {number}" for name, number in told.items()),
+        "versions": ", ".join(f"{name} {number}" for name, number in reported.items()),
     }
 
 
@@ -134,8 +134,8 @@ def wrap_paragraph(words: str) -> list[str]:
 
 def write_table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return a table of a page."""
-    told = ["| " + " | ".join(row) + " |" for row in (names, *rows)]
-    return [told[0], "|---" * len(names) + "|", *told[1:]]
+    reported = ["| " + " | ".join(row) + " |" for row in (names, *rows)]
+    return [reported[0], "|---" * len(names) + "|", *reported[1:]]
 
 
 def format_share(count: int, total: int) -> str:

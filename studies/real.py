@@ -127,8 +127,8 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
             rows = [[n, f"{v:.4g}", f"{1.96 * s:.2g}", unit] for n, (v, s, unit) in window["values"].items()]
             if rows:
                 lines += [*write_table(["", "value", "95 % within", "unit"], rows), ""]
-            said = [*window["reasons"], *(f"(warning) {text}" for text in window["warnings"])]
-            lines += wrap_paragraph(("Believed. " if window["believed"] else "Not believed. ") + "; ".join(said))
+            message = [*window["reasons"], *(f"(warning) {text}" for text in window["warnings"])]
+            lines += wrap_paragraph(("Believed. " if window["believed"] else "Not believed. ") + "; ".join(message))
     lines += wrap_paragraph(
         f"""The scope does not say the rated torque; {RATED_TORQUE_NM} N.m of a 750 W motor is assumed, so that inertia
         and friction stand in proportion to it."""

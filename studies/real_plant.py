@@ -329,16 +329,16 @@ def make_recording(
     run: Run, mechanics: Mechanics, sensors: Sensors, rapid_m_s: float, seed: int = 0, *, voltage: bool = True
 ) -> Recording:
     """Return the run as a recording is read from disk."""
-    told = report_signals(run, mechanics, sensors, seed)
+    reported = report_signals(run, mechanics, sensors, seed)
     return Recording(
         axis="X",
         dt_s=run.dt_s,
         time_s=freeze_array(np.arange(run.speed.size) * run.dt_s),
-        voltage_v=freeze_array(told["voltage_V"]) if voltage else None,
-        current_a=freeze_array(told["current_A"]),
-        speed_rad_s=freeze_array(told["speed_rad_per_s"]),
-        position_mm=freeze_array(told["position_m"] * 1e3),
-        demand_mm=freeze_array(told["demand_m"] * 1e3),
+        voltage_v=freeze_array(reported["voltage_V"]) if voltage else None,
+        current_a=freeze_array(reported["current_A"]),
+        speed_rad_s=freeze_array(reported["speed_rad_per_s"]),
+        position_mm=freeze_array(reported["position_m"] * 1e3),
+        demand_mm=freeze_array(reported["demand_m"] * 1e3),
         voltage_sampling=sensors.sampling,
         pitch_mm=mechanics.pitch_m * 1e3,
         rapid_speed_rad_s=rapid_m_s / mechanics.pitch_m * 2 * np.pi,

@@ -197,13 +197,13 @@ def make_config(machine: Machine) -> MachineConfig:
     """Return the machine's configuration: the base's nominal values and the configured regulators."""
     m, _, rapid_m_s, acceleration_m_s2, _ = BASES[machine.base]
     gains = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki", "current_kp", "current_ki")
-    told = {k: v for k, v in asdict(machine.told).items() if k in (*gains, "current_limit_a", "voltage_limit_v")}
+    reported = {k: v for k, v in asdict(machine.told).items() if k in (*gains, "current_limit_a", "voltage_limit_v")}
     axis = {
         "screw_pitch_mm": m.pitch_m * 1e3,
         "rapid_speed_mm_s": rapid_m_s * 1e3,
         "max_acceleration_mm_s2": acceleration_m_s2 * 1e3,
         "nominal": m.truth(),
-        "regulators": told,
+        "regulators": reported,
         "correction": {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 2000.0},
     }
     if machine.told_resonance_hz:
@@ -232,10 +232,10 @@ def analyse_machine(machine: Machine, seed: int) -> tuple[list[WindowOutcome], f
     for k, share in enumerate(SHARES):
         demand = make_shuttle_demand(0.4, share * rapid_m_s, acceleration_m_s2, RAPIDS)
         moved = simulate_axis(machine.mechanics, demand, machine.loops)
-        told = make_recording(moved, machine.mechanics, machine.sensors, rapid_m_s, 1000 * seed + k)
+        reported = make_recording(moved, machine.mechanics, machine.sensors, rapid_m_s, 1000 * seed + k)
         outcomes += [
             analyse_window(w, config.identification, config.axis["X"], config.machine.sync_period_s)
-            for w in find_windows(told)
+            for w in find_windows(reported)
         ]
         following.append(compute_rms((moved.motor_m - moved.demand) * 1e6))
     settings, axis, period_s = config.identification, config.axis["X"], config.machine.sync_period_s
@@ -282,15 +282,15 @@ def measure_contour_error(
         return compute_contour_error_um(reference.path_mm, places, reference.dt_s)
 
     before = error_um(simulate_cut(machine, reference)[0])
-    lesson, wanted, passes = LearnedOffset.make_empty(reference), dict(planned), []
+    learned, wanted, passes = LearnedOffset.make_empty(reference), dict(planned), []
     for _ in range(PASSES + 1):
         table, motor = simulate_cut(machine, reference, wanted)
         passes.append(error_um(table))
         ahead = compute_table_deflection_mm(reference.position_mm, wanted, models, config)
         seen = motor + np.column_stack([ahead.get(axis, np.zeros(len(motor))) for axis in reference.axes])
         own = {axis: (reference.position_mm[axis] - seen[:, k]) * 1e3 for k, axis in enumerate(reference.axes)}
-        lesson = learn_from_pass(lesson, own, compute_rms(error_um(seen)), models, config)
-        rough = {axis: planned[axis] + lesson.offset_um[axis] for axis in reference.axes}
+        learned = learn_from_pass(learned, own, compute_rms(error_um(seen)), models, config)
+        rough = {axis: planned[axis] + learned.offset_um[axis] for axis in reference.axes}
         wanted = fit_all_axes(rough, config.axis, reference.dt_s)
     after = passes[0]
     return (
@@ -317,7 +317,7 @@ def examine_machine(machine: Machine, seed: int = 0) -> Found:
     outcomes, following_um, loops = analyse_machine(machine, seed)
     settings = make_config(machine).identification
     estimate, verdict = pool_windows(outcomes, settings)
-    told = [compute_errors(o.estimate, machine.truth(o.window.direction)) for o in outcomes if o.verdict.accepted]
+    reported = [compute_errors(o.estimate, machine.truth(o.window.direction)) for o in outcomes if o.verdict.accepted]
     candidates = [estimate, *(o.estimate for o in outcomes)]  # a refused model is cut with all the same
     usable = [e.build_parameters() for e in candidates if e is not None and _examine_all(e)]
     nothing = (np.nan, np.nan, np.nan, ())
@@ -331,8 +331,8 @@ def examine_machine(machine: Machine, seed: int = 0) -> Found:
         sum(o.verdict.accepted for o in outcomes),
         verdict.accepted,
         *compute_errors(estimate, machine.truth()),
-        np.array([e for e, _ in told]).reshape(-1, 6),
-        np.array([d for _, d in told]).reshape(-1, 6),
+        np.array([e for e, _ in reported]).reshape(-1, 6),
+        np.array([d for _, d in reported]).reshape(-1, 6),
         float(np.mean(left)) if left else None,
         following_um,
         before_um,
@@ -360,12 +360,12 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 def page(told: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page."""
     several = figures["random"]
-    believed, windows = (sum(f[key] for f in several) for key in ("believed", "windows"))
+    accepted, windows = (sum(f[key] for f in several) for key in ("believed", "windows"))
     gains = np.array([f["before_um"] / f["after_um"] for f in several if f["after_um"]], dtype=np.float64)
     taught = np.array([f["before_um"] / f["passes_um"][-1] for f in several if f["passes_um"]], dtype=np.float64)
     lines = pages.write_head("Machines as they are", "reality", told)
     lines += wrap_paragraph(
-        f"""Of {len(several)} machines with every effect at a random level, {believed} of {windows} rapids are
+        f"""Of {len(several)} machines with every effect at a random level, {accepted} of {windows} rapids are
         believed, and {sum(f["pooled"] for f in several)} pools. The contour error of the bench path at the table falls
         by {np.median(gains):.1f} times in the median, by {np.percentile(gains, 5):.1f} at the fifth percentile; no
         point gets worse by more than {max((f["worse_um"] or 0.0) for f in several):.2f} um. After {PASSES} passes that
@@ -413,11 +413,11 @@ def _format_row(f: Mapping[str, Any]) -> list[str]:
     gain = "-" if not f["after_um"] else f"{f['before_um'] / f['after_um']:.1f}"
     worst = "-" if f["worse_um"] is None else f"{f['worse_um']:.1f}"
     learned = f"{f['passes_um'][-1]:.2f}" if f["passes_um"] else "-"
-    believed = f"{f['believed']}/{f['windows']}"
+    accepted = f"{f['believed']}/{f['windows']}"
     return [
         f["base"],
         f["name"],
-        believed,
+        accepted,
         "yes" if f["pooled"] else "no",
         errors,
         left,

@@ -21,8 +21,8 @@ def of_signals(fault: SignalFault) -> Callable[[Rng], FaultyRecording]:
     def make(rng: Rng) -> FaultyRecording:
         scene = draw_scene(rng)
         rows = measure_run(rng, scene, drives.simulate_loop(scene.drive, demand_of(scene), scene.dt_s))
-        spoilt, severity = fault(rng, rows)
-        return FaultyRecording(make_recording(scene, spoilt), severity)
+        corrupted, severity = fault(rng, rows)
+        return FaultyRecording(make_recording(scene, corrupted), severity)
 
     return make
 

@@ -118,8 +118,8 @@ def compute_detected_share(count: int, worn: int, shift: float, groups: int, see
         courses = draw_machines(rng, count)
         for k in range(worn):
             courses[k] = replace(courses[k], values=freeze_array(courses[k].values * (1 + shift * SPREAD)))
-        told = compute_scores(courses)
-        found += sum(told[f"mill-{k}"] > 1 for k in range(worn))
+        reported = compute_scores(courses)
+        found += sum(reported[f"mill-{k}"] > 1 for k in range(worn))
     return found / (groups * worn)
 
 

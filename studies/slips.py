@@ -76,16 +76,16 @@ class Reader:
         words = {*_list_keys(lines[number]), *_list_keys(text.splitlines()[min(number, text.count(chr(10)))])}
         around = {word for line in lines[max(0, number - 1) : number + 2] for word in _list_keys(line)} | words
         try:
-            told, found = self._read(text)
+            reported, found = self._read(text)
         except ConfigError as error:
-            said = str(error)
-            placed = any(word in said for word in around) or _describe_line(said) in range(number, number + 4)
-            return "refused" if placed or "at end of document" in said else "unplaced"
+            message = str(error)
+            placed = any(word in message for word in around) or _describe_line(message) in range(number, number + 4)
+            return "refused" if placed or "at end of document" in message else "unplaced"
         changed = {path for path in {*found, *self._true} if found.get(path) != self._true.get(path)}
         if not changed:
             return "same"
         if all({*path.split(".")} & words for path in changed):
-            return "absent" if {*self._told} - {*told} else "value"
+            return "absent" if {*self._told} - {*reported} else "value"
         section = _find_section(lines, number)
         return "absent" if all(section in path for path in changed) else "elsewhere"
 

@@ -67,11 +67,11 @@ def record_slowly(rng: Rng, scene: Scene, fine: Signals, late: float | None = No
     delay = (rng.uniform(-0.5, 0.5) if late is None else late) * period
     begin = rng.uniform(0.0, period)
     count = int((rows.signals["speed"].size * rows.dt_s - begin) / period)
-    told = sample_voltage(
+    reported = sample_voltage(
         fine.voltage, drives.STEP_S, begin - delay + np.arange(count) * period, period, scene.sampling
     )
-    peak = float(np.abs(told).max())
-    sensor = Sensor(told, scene.noise * 0.4 * peak, scene.steps[0] * peak)
+    peak = float(np.abs(reported).max())
+    sensor = Sensor(reported, scene.noise * 0.4 * peak, scene.steps[0] * peak)
     return Sensed(rows, sensor.read_values(rng), begin, period, sensor)
 
 

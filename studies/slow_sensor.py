@@ -61,8 +61,10 @@ def record_slow_windows(
     for window in find_windows(parse_recording(bench.format_as_csv(clean, noise, seed))):
         count = int((window.n * window.dt_s - begin_s) / period_s)
         begin = window.start_s + begin_s - delay_s + np.arange(count) * period_s
-        told = sample_voltage(fine, bench.STEP_S, begin, period_s, sampling) + noise * 60 * rng.standard_normal(count)
-        slow = SlowVoltage(begin_s, period_s, 0.0002, freeze_array(told))
+        reported = sample_voltage(fine, bench.STEP_S, begin, period_s, sampling) + noise * 60 * rng.standard_normal(
+            count
+        )
+        slow = SlowVoltage(begin_s, period_s, 0.0002, freeze_array(reported))
         answer.append(replace(window, voltage_v=None, voltage_sampling=sampling, slow_voltage=slow))
     return answer
 
@@ -163,8 +165,8 @@ def _describe_sampling(found: Sequence[Mapping[str, Any]]) -> str:
         most = [f"{name} {worst:.2g}" for name, worst in zip(PARAMETERS, rms.max(axis=0), strict=False)]
         words.append(f"{sampling.replace('_', ' ')}s at most {', '.join(most)} %")
     shares = [(share, name, told) for told in found for share, name in _compute_shares(told)]
-    share, name, told = min(shares, key=lambda one: one[0])
-    place = f"{told['sampling'].replace('_', ' ')}s at {1 / told['period_s']:g} Hz and {100 * told['noise']:g} % noise"
+    share, name, reported = min(shares, key=lambda one: one[0])
+    place = f"{reported['sampling'].replace('_', ' ')}s at {1 / reported['period_s']:g} Hz and {100 * reported['noise']:g} % noise"
     return f"""RMS errors: {"; ".join(words)}. Of all 95 % intervals that of {name} holds the truth least often:
         {100 * share:.0f} % ({place})."""
 
@@ -192,8 +194,8 @@ def main() -> None:
 
     def seeds(options: argparse.Namespace) -> str:
         last = [options.first + count - 1 for count in (options.runs, options.good, options.bad)]
-        told = [f"{what} {options.first} to {k}" for what, k in zip(("rapids", "good", "bad"), last, strict=True)]
-        return f"study {options.study}; {', '.join(told)}"
+        reported = [f"{what} {options.first} to {k}" for what, k in zip(("rapids", "good", "bad"), last, strict=True)]
+        return f"study {options.study}; {', '.join(reported)}"
 
     def measured(options: argparse.Namespace) -> dict[str, Any]:
         runs, good, bad = (range(options.first, options.first + n) for n in (options.runs, options.good, options.bad))

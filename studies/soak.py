@@ -169,18 +169,18 @@ def compute_figures(folder: Path, per_day: bool) -> dict[str, Any]:
 
 
 def _describe_process(name: str, life: Sequence[Mapping[str, Any]], where: str, day: float) -> dict[str, Any]:
-    told = [sample["process"][name] for sample in life]
+    reported = [sample["process"][name] for sample in life]
     over = [sample[where] for sample in life]
     grown = {
-        key: None if (found := fit_slope(over, [each[key] for each in told])) is None else asdict(found.scale(day))
+        key: None if (found := fit_slope(over, [each[key] for each in reported])) is None else asdict(found.scale(day))
         for key in ("resident_mb", "anonymous_mb", *FLAT)
     }
     return {
         "samples": len(life),
-        "resident_mb": [told[0]["resident_mb"], told[-1]["resident_mb"]],
+        "resident_mb": [reported[0]["resident_mb"], reported[-1]["resident_mb"]],
         "a_day": grown,
-        **{key: [min(each[key] for each in told), max(each[key] for each in told)] for key in FLAT},
-        "zombies": max(each["zombies"] for each in told),
+        **{key: [min(each[key] for each in reported), max(each[key] for each in reported)] for key in FLAT},
+        "zombies": max(each["zombies"] for each in reported),
     }
 
 
@@ -190,7 +190,7 @@ def evaluate_goal(week: Mapping[str, Any], hours: Sequence[Mapping[str, Any]]) -
     In a few real hours a growth per day is known to some 10 MB: there nothing may grow for certain.
     """
     worked_h, real_h = week.get("rapids", 0) / A_DAY * 24, sum(run["hours"] for run in hours)
-    met, told = worked_h >= WEEK_H and real_h >= REAL_H, []
+    met, reported = worked_h >= WEEK_H and real_h >= REAL_H, []
     for runs, what, certain in (
         ([week] if week else [], f"{worked_h:.3g} of {WEEK_H:.0f} h of work at speed-up", False),
         (hours, f"{real_h:.3g} of {REAL_H:.0f} real hours", True),
@@ -199,10 +199,10 @@ def evaluate_goal(week: Mapping[str, Any], hours: Sequence[Mapping[str, Any]]) -
         met &= {name for name, _ in growths} == set(OURS)
         met &= all((growth.low if certain else growth.value) < MOST_MB_A_DAY for _, growth in growths)
         name, growth = max(growths, key=lambda each: each[1].value, default=("nothing", None))
-        told.append(what + (f", steepest {name} {_describe_goal(growth)} MB a day" if growth else ""))
+        reported.append(what + (f", steepest {name} {_describe_goal(growth)} MB a day" if growth else ""))
     emergencies = sum(run.get("happened", {}).get("emergencies", 0) for run in (week, *hours))
     met &= emergencies >= EMERGENCIES
-    return {"met": met, "figure": f"{'; '.join(told)}; {emergencies:,} emergencies"}
+    return {"met": met, "figure": f"{'; '.join(reported)}; {emergencies:,} emergencies"}
 
 
 def _iterate_growth(run: Mapping[str, Any]) -> Iterator[tuple[str, Slope]]:
@@ -289,8 +289,8 @@ def _hours_words(hours: Mapping[str, Any]) -> list[str]:
 
 
 def _describe_measurement(run: Mapping[str, Any]) -> str:
-    told = run["run"]
-    return f"Measured by `{told['command']}` on {told['date']}, commit {told['commit']}."
+    reported = run["run"]
+    return f"Measured by `{reported['command']}` on {reported['date']}, commit {reported['commit']}."
 
 
 def _build_tables(run: Mapping[str, Any], day: str) -> list[str]:

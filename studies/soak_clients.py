@@ -44,9 +44,9 @@ def browse_pages(shop: MachineRig) -> int:
     address = shop.url.replace("http", "ws", 1) + "/api/live/stream?seconds=10&columns=400"
     with connect(address, subprotocols=["fdhil"], open_timeout=WAIT_S) as stream:  # type: ignore[list-item]
         for _ in range(6):
-            told = stream.recv(timeout=WAIT_S)
-            if isinstance(told, bytes):
-                header = json.loads(told[4 : 4 + int.from_bytes(told[:4], "little")])
+            reported = stream.recv(timeout=WAIT_S)
+            if isinstance(reported, bytes):
+                header = json.loads(reported[4 : 4 + int.from_bytes(reported[:4], "little")])
                 stream.send(json.dumps({"drawn": header["number"]}))
     return bad
 

@@ -117,7 +117,7 @@ class Life:
             except OSError:
                 continue
         axes = status.get("axes", {})
-        told = {
+        reported = {
             "at_s": self.at_s,
             "round": self.rounds,
             "rapids": {name: [axis["accepted"], axis["refused"]] for name, axis in axes.items()},
@@ -132,7 +132,7 @@ class Life:
             "restarts": dict(self.shop.restarts),
         }
         with self.samples.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(told) + "\n")
+            file.write(json.dumps(reported) + "\n")
 
 
 @dataclass(frozen=True)
@@ -255,11 +255,11 @@ def disk_full(life: Life) -> int:
         pass
     shop.play_program(shop.folder / "round.ngc")
     life.settle()
-    told = shop.read_status_part("store").get("fault")
+    reported = shop.read_status_part("store").get("fault")
     ballast.unlink()
     shop.play_program(shop.folder / "round.ngc")
     life.settle()
-    return int(told is None) + int(shop.read_status_part("store").get("fault") is not None)
+    return int(reported is None) + int(shop.read_status_part("store").get("fault") is not None)
 
 
 def acknowledge(life: Life) -> int:

@@ -233,7 +233,7 @@ class MachineRig:
         """Switch the NC on or off, trying again while a drive is not ready for it."""
         for _ in range(TRIES):
             self.twin.send_command("nc", on=on)
-            if (told := self.read_event("nc")) and told["on"] is on:
+            if (reported := self.read_event("nc")) and reported["on"] is on:
                 return
             time.sleep(LOOK_S)
         raise FdhilError(f"the NC of the simulated machine does not get {'the drives' if on else 'out'}")

@@ -29,16 +29,16 @@ class Used:
 
 def measure_usage(pid: int) -> Used:
     """Return what a process uses now; OSError when it is gone."""
-    told = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text("utf-8").splitlines())
-    if "VmRSS" not in told:  # it has ended, and nobody has waited for it yet
+    reported = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text("utf-8").splitlines())
+    if "VmRSS" not in reported:  # it has ended, and nobody has waited for it yet
         raise ProcessLookupError(pid)
-    resident, anonymous = (int(told[name].split()[0]) / 1024 for name in ("VmRSS", "RssAnon"))
+    resident, anonymous = (int(reported[name].split()[0]) / 1024 for name in ("VmRSS", "RssAnon"))
     states = list_children(pid)
     return Used(
         resident,
         anonymous,
         len(list(Path(f"/proc/{pid}/fd").iterdir())),
-        int(told["Threads"]),
+        int(reported["Threads"]),
         len(states),
         states.count("Z"),
     )

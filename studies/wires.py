@@ -83,10 +83,10 @@ def lose_frames(frames: int, seed: int, can_ids: set[int], percent: float) -> Co
             for k, volts, amperes in zip(samples.tick, samples.voltage_v, samples.current_a, strict=True):
                 true = (wire.build_tpdo2(int(k) + 1)[2] * 0.02, wire.build_tpdo2(int(k))[1] * 0.05)
                 seen["misplaced"] += abs(volts - true[0]) > 1e-6 or abs(amperes - true[1]) > 1e-6
-        told = decoder.read_counters()
+        reported = decoder.read_counters()
         seen["lost"] += faults.total("drop")
-        seen["reported"] += told["sync_missed"] + told["pdo_lost"]
-        seen["late"] += told["pdo_late"] + told["pdo_duplicates"]
+        seen["reported"] += reported["sync_missed"] + reported["pdo_lost"]
+        seen["late"] += reported["pdo_late"] + reported["pdo_duplicates"]
     return seen
 
 
@@ -131,24 +131,24 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
 def evaluate_goals(promised: Mapping[str, Mapping[str, int]], frames: list[list[Any]]) -> dict[str, Any]:
     """Return the goals R8 and R9 by the counts."""
-    wrong, late, spoilt = (sum(seen.get(key, 0) for seen in promised.values()) for key in ("wrong", "late", "spoilt"))
-    stale = promised.get(SDO, {}).get("late", 0)
-    lost, told, sent = (sum(seen.get(key, 0) for _, _, seen in frames) for key in ("lost", "reported", "frames"))
-    told_of = (
-        f"{wrong} of {late - stale:,} stale and {spoilt:,} wrong Modbus answers and {stale:,} stale SDO answers taken"
+    wrong, late, corrupted = (
+        sum(seen.get(key, 0) for seen in promised.values()) for key in ("wrong", "late", "spoilt")
     )
+    stale = promised.get(SDO, {}).get("late", 0)
+    lost, reported, sent = (sum(seen.get(key, 0) for _, _, seen in frames) for key in ("lost", "reported", "frames"))
+    told_of = f"{wrong} of {late - stale:,} stale and {corrupted:,} wrong Modbus answers and {stale:,} stale SDO answers taken"
     exact = all(seen.get("lost", 0) == seen.get("reported", 0) and not seen.get("misplaced") for _, _, seen in frames)
     return {
         "R8": {"met": wrong == 0, "figure": told_of},
-        "R9": {"met": exact, "figure": f"{told:,} reported of {lost:,} lost among {sent:,} frames"},
+        "R9": {"met": exact, "figure": f"{reported:,} reported of {lost:,} lost among {sent:,} frames"},
     }
 
 
 def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page; its conclusions follow from the figures."""
-    told = figures["goals"]
+    reported = figures["goals"]
     lines = pages.write_head("Spoilt wires", "wires", run)
-    lines += pages.wrap_paragraph(f"**{told['R8']['figure']}; {told['R9']['figure']}.**")
+    lines += pages.wrap_paragraph(f"**{reported['R8']['figure']}; {reported['R9']['figure']}.**")
     lines += pages.wrap_paragraph(
         """What is asked for changes with every question, so an answer to another question is known by its value. Nine
         of ten answers on a serial line take a while, late is what came after the time-out. Where the row says how, more

@@ -84,8 +84,8 @@ class Plant:
 
     def _record_move(self, moved: Run, seed: int, *, voltage: bool = True) -> Recording:
         m = self.machine.mechanics
-        told = make_recording(moved, m, self.machine.sensors, self.rapid_m_s, seed, voltage=voltage)
-        return told if voltage else replace(told, torque_constant_nm_per_a=m.K)
+        reported = make_recording(moved, m, self.machine.sensors, self.rapid_m_s, seed, voltage=voltage)
+        return reported if voltage else replace(reported, torque_constant_nm_per_a=m.K)
 
     def read_other_move(self, name: str) -> Array:
         """Return a signal of the other move, as long as the first."""
@@ -212,12 +212,12 @@ def assess_fault(plant: Plant, recorded: Recording, fault: Fault, *, configured:
     No loops of the drive's own are sought: where the configured ones do not explain the rapid, it is refused.
     """
     axis = plant.axis if configured else None
-    spoilt = apply_fault(recorded, fault)
+    corrupted = apply_fault(recorded, fault)
     period_s = 1e-3 if configured else None
-    outcomes = [analyse_window(window, Identification(), axis, period_s) for window in find_windows(spoilt)]
+    outcomes = [analyse_window(window, Identification(), axis, period_s) for window in find_windows(corrupted)]
     estimate, verdict = pool_windows(outcomes, Identification())
     reasons = list(verdict.reasons)
-    hidden = None if outcomes else explain_missing_move(spoilt)
+    hidden = None if outcomes else explain_missing_move(corrupted)
     reasons += [] if hidden is None else [hidden]
     nominal = Parameters(**plant.axis.nominal.model_dump())
     if configured and estimate is not None and (gain := detect_gain_error(estimate, nominal)) is not None:

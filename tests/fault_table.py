@@ -51,8 +51,8 @@ class FaultTable:
             self.document: dict[str, Any] = json.loads(self.figures.read_text("utf-8"))
         else:
             self.document = {"run": read_provenance(), "rows": {row: create_blank() for row in ROWS}, "goals": {}}
-        for told in self.document["rows"].values():
-            told |= {self._passed: 0, self._failed: []}
+        for reported in self.document["rows"].values():
+            reported |= {self._passed: 0, self._failed: []}
         self._rows_of: dict[str, tuple[str, ...]] = {}
         self._goals_of: dict[str, tuple[str, ...]] = {}
 
@@ -67,12 +67,12 @@ class FaultTable:
         """Count a completed test, and one that failed in set-up or tear-down."""
         seen = dict(report.user_properties)
         for row in self._rows_of.get(report.nodeid, ()):
-            told = self.document["rows"][row]
+            reported = self.document["rows"][row]
             if report.failed:
-                told[self._failed].append(report.nodeid)
+                reported[self._failed].append(report.nodeid)
             elif report.passed and report.when == "call":
-                told[self._passed] += 1
-                told["sync_to_zero"] += [seen["sync_to_zero"]] if "sync_to_zero" in seen else []
+                reported[self._passed] += 1
+                reported["sync_to_zero"] += [seen["sync_to_zero"]] if "sync_to_zero" in seen else []
         for goal in self._goals_of.get(report.nodeid, ()):
             if report.failed:
                 self._record_outcome(goal, False, f"{report.nodeid} failed")
@@ -136,7 +136,9 @@ def gather_outcomes(document: dict[str, Any], folder: Path) -> None:
     figure, met = summarise_matrix(document["rows"]), has_survived_all(document["rows"])
     own["R1"] = [{"met": met, "figure": figure.rstrip("."), "by": goals.SOURCE, **run}]
     studied = goals.read_study_goals(folder)
-    document["goals"] = {goal: told for goal in goals.GOALS if (told := [*own.get(goal, ()), *studied.get(goal, ())])}
+    document["goals"] = {
+        goal: reported for goal in goals.GOALS if (reported := [*own.get(goal, ()), *studied.get(goal, ())])
+    }
     kills = folder / "kills.json"
     measured = json.loads(kills.read_text("utf-8"))["figures"] if kills.exists() else {}
     document["kills"] = {row: told for row, told in measured.get("sync_to_zero", {}).items() if row in ROWS}
@@ -187,15 +189,15 @@ def summarise_matrix(rows: Mapping[str, Told]) -> str:
     good = sum(has_survived(told) == "yes" for told in rows.values())
     bad = sum(has_survived(told) == "**no**" for told in rows.values())
     real = sum(told["real_passed"] > 0 for told in rows.values())
-    told = f"{good} of {len(rows)} rows survived, {bad} not, {len(rows) - good - bad} were not tested"
-    return f"{told}; {real} were tested on a real SocketCAN interface too."
+    reported = f"{good} of {len(rows)} rows survived, {bad} not, {len(rows) - good - bad} were not tested"
+    return f"{reported}; {real} were tested on a real SocketCAN interface too."
 
 
 def format_page(document: Mapping[str, Any]) -> str:
     run, found = document["run"], document["goals"]
-    told = f"{summarise_matrix(document['rows'])} Measured on {run['date']} at commit {run['commit']}."
+    reported = f"{summarise_matrix(document['rows'])} Measured on {run['date']} at commit {run['commit']}."
     reached = (goals.summarise_goals(found), "", *goals.format_goal_lines(found))
-    return "\n".join((HEAD, told, "", *format_table(document), "", GOALS, *reached, ""))
+    return "\n".join((HEAD, reported, "", *format_table(document), "", GOALS, *reached, ""))
 
 
 def write_page(document: Mapping[str, Any], path: Path) -> None:

@@ -47,11 +47,11 @@ def read_study_goals(folder: Path) -> dict[str, list[dict[str, Any]]]:
     for path in sorted(folder.glob("*.json")):
         document = json.loads(path.read_text("utf-8"))
         run = document.get("run", {})
-        for goal, told in _read_goals(document).items():
+        for goal, reported in _read_goals(document).items():
             if goal not in GOALS:
                 raise ValueError(f"{path.name} tells of a goal {goal} that there is not")
             when = {"by": run.get("command", ""), "date": run.get("date", ""), "commit": run.get("commit", "")}
-            found.setdefault(goal, []).append({"met": bool(told["met"]), "figure": str(told["figure"]), **when})
+            found.setdefault(goal, []).append({"met": bool(reported["met"]), "figure": str(reported["figure"]), **when})
     return found
 
 
@@ -59,8 +59,8 @@ def _read_goals(document: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
     figures = document.get("figures", {})
     if document.get("study") == "verdicts":
         return {"R10": evaluate_verdicts(figures)}
-    told = figures.get("goals", {}) if isinstance(figures, Mapping) else {}
-    return told if isinstance(told, Mapping) else {}
+    reported = figures.get("goals", {}) if isinstance(figures, Mapping) else {}
+    return reported if isinstance(reported, Mapping) else {}
 
 
 def evaluate_verdicts(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Any]:
@@ -87,11 +87,11 @@ def format_goal_lines(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Itera
     yield "| goal | about | to reach | measured | met | by | on |"
     yield "|---|---|---|---|---|---|---|"
     for identity, (goal, bar) in GOALS.items():
-        told = found.get(identity, ())
-        measured = "; ".join(dict.fromkeys(each["figure"] for each in told)) or "not measured"
-        met = "yes" if told and all(each["met"] for each in told) else "**no**" if told else ""
-        by = ", ".join(dict.fromkeys(f"`{each['by']}`" for each in told))
-        days = ", ".join(dict.fromkeys(f"{each['date']} ({each['commit']})" for each in told))
+        reported = found.get(identity, ())
+        measured = "; ".join(dict.fromkeys(each["figure"] for each in reported)) or "not measured"
+        met = "yes" if reported and all(each["met"] for each in reported) else "**no**" if reported else ""
+        by = ", ".join(dict.fromkeys(f"`{each['by']}`" for each in reported))
+        days = ", ".join(dict.fromkeys(f"{each['date']} ({each['commit']})" for each in reported))
         yield f"| {identity} | {goal} | {bar} | {measured} | {met} | {by} | {days} |"
 
 

@@ -72,10 +72,10 @@ def test_number_refuses_text_and_booleans(value: object) -> None:
     document["axis"]["X"]["correction"] = {"max_offset_um": value}
     document["sim"] = {"seed": value, "axis": {"X": {"limit_switches_mm": [value, 1.0]}}}
     document["bus"] = {"can0": {"bitrate": value}}
-    told = list_faults(document)
+    reported = list_faults(document)
     keys = ("axis.X.nominal.R", "axis.X.correction.max_offset_um", "sim.seed", "bus.can0.bitrate")
     for key in (*keys, "sim.axis.X.limit_switches_mm.0"):
-        assert f"{key}: must be a number, not {value!r}" in told
+        assert f"{key}: must be a number, not {value!r}" in reported
 
 
 @pytest.mark.parametrize("value", [1, 0.0, "yes", "true"])
@@ -208,9 +208,9 @@ def test_number_out_of_range_is_reported_with_the_range(section: str, key: str, 
     for part in section.split("."):
         table = table.setdefault(part, {})
     table[key] = value
-    told = list_faults(document)
-    assert f"{section}.{key}" in told
-    assert range_ in told
+    reported = list_faults(document)
+    assert f"{section}.{key}" in reported
+    assert range_ in reported
 
 
 def test_every_number_of_every_section_has_a_range() -> None:
@@ -224,13 +224,13 @@ def test_every_number_of_every_section_has_a_range() -> None:
                 if issubclass(kind, config.Section):
                     walk(kind, f"{place}{key}.")
                 elif kind in (int, float):
-                    told = list(config_loader._iterate_constraints(field)) + list(
+                    reported = list(config_loader._iterate_constraints(field)) + list(
                         config_loader._iterate_constraints(field.annotation)
                     )
-                    bounded = any(hasattr(c, "le") for c in told) and any(
-                        hasattr(c, "ge") or hasattr(c, "gt") for c in told
+                    bounded = any(hasattr(c, "le") for c in reported) and any(
+                        hasattr(c, "ge") or hasattr(c, "gt") for c in reported
                     )
-                    bounded |= any(getattr(c, "func", None) is _check_magnitude for c in told)
+                    bounded |= any(getattr(c, "func", None) is _check_magnitude for c in reported)
                     if not bounded and key != "sign":
                         open_ended.append(f"{place}{key}")
 
@@ -261,6 +261,6 @@ def test_hostile_file_is_a_short_config_error(text: str, expected: str, tmp_path
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
         config.load_config(path)
-    told = str(caught.value)
-    assert expected in told
-    assert len(told) < 12_000
+    reported = str(caught.value)
+    assert expected in reported
+    assert len(reported) < 12_000

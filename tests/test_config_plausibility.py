@@ -56,13 +56,13 @@ def test_bench_and_friction_dominated_machine_are_ordinary() -> None:
 def test_number_in_another_unit_is_reported_with_that_unit(slip: UnitMistake, machine: dict[str, Any]) -> None:
     made = build_document(**machine)
     true = set_value(made["axis"]["X"], slip.key, 1 / slip.factor)
-    told = list_faults(made)
+    reported = list_faults(made)
     if slip.unit in ("mohm", "m/s", "N.cm", "mN.m.s") and machine:  # a machine could be so; the bench could not
-        assert told == "" or f"axis.X.{slip.key}" in told
+        assert reported == "" or f"axis.X.{slip.key}" in reported
         return
-    assert f"axis.X.{slip.key}" in told
-    assert f"{slip.key} = {true:.4g} (" in told
-    assert f" {slip.unit})" in told
+    assert f"axis.X.{slip.key}" in reported
+    assert f"{slip.key} = {true:.4g} (" in reported
+    assert f" {slip.unit})" in reported
 
 
 def test_inductance_in_millihenry_is_refused() -> None:

@@ -130,11 +130,11 @@ def test_huge_number_in_program_is_a_program_error(line: str) -> None:
     try:
         list(interpret([line, "M2"], Budget.create_from_config(Nc())))
     except ProgramError as error:
-        told = str(error)
+        reported = str(error)
     else:
-        told = ""  # a line number of any length means nothing
+        reported = ""  # a line number of any length means nothing
         assert line[0] == "N"
-    assert len(told) < 300
+    assert len(reported) < 300
 
 
 @pytest.mark.parametrize("text", ["a = " + "[" * 100_000, "a = " + "9" * 5000, "a = 0x" + "f" * 5000])

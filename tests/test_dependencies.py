@@ -67,9 +67,9 @@ def test_package_with_wrong_hash_is_not_installed(tmp_path: Path) -> None:
     ]
     assert subprocess.run([*command, "--target", str(tmp_path / "a")], capture_output=True, check=False).returncode == 0
     make_wheel(tmp_path, "import os; os.system('evil')")
-    told = subprocess.run([*command, "--target", str(tmp_path / "b")], capture_output=True, text=True, check=False)
-    assert told.returncode != 0
-    assert "DO NOT MATCH THE HASHES" in told.stderr
+    reported = subprocess.run([*command, "--target", str(tmp_path / "b")], capture_output=True, text=True, check=False)
+    assert reported.returncode != 0
+    assert "DO NOT MATCH THE HASHES" in reported.stderr
     assert not (tmp_path / "b").exists()
 
 

@@ -129,8 +129,8 @@ def find_untried_blocks(page: Path) -> Iterator[str]:
     """Yield the first line of each block without a test and without a reason."""
     for before, language, body in re.findall(r"([^\n]*)\n```(\w*)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
         commands = language in ("sh", "bash") and re.search(r"^fdhil(-guard)? ", body, re.MULTILINE)
-        told = re.fullmatch(r"<!-- not run: \S.* -->", before)
-        if not (commands or told or language == "toml" or (page.name, language) in RUN):
+        reported = re.fullmatch(r"<!-- not run: \S.* -->", before)
+        if not (commands or reported or language == "toml" or (page.name, language) in RUN):
             yield body.partition("\n")[0]
 
 

@@ -47,9 +47,9 @@ def test_different_loops_are_reported_and_used(filtered_outcomes: list[WindowOut
     assert has_loop_mismatch(filtered_outcomes)
     found = identify_from_outcomes(filtered_outcomes, AXIS, SETTINGS, PERIOD_S)
     assert found is not None
-    told = dict(zip(found.names, found.values.tolist(), strict=True))
-    assert told["speed_filter_s"] == pytest.approx(0.001, rel=0.05)
-    assert told["speed_kp"] == pytest.approx(AXIS.regulators.speed_kp, rel=0.05)
+    reported = dict(zip(found.names, found.values.tolist(), strict=True))
+    assert reported["speed_filter_s"] == pytest.approx(0.001, rel=0.05)
+    assert reported["speed_kp"] == pytest.approx(AXIS.regulators.speed_kp, rel=0.05)
     better = adopt_loops(AXIS, found)
     assert better is not None
     again = [analyse_window(outcome.window, SETTINGS, better, PERIOD_S) for outcome in filtered_outcomes]

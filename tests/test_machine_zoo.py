@@ -48,8 +48,8 @@ def test_moves_end_at_target_within_limits() -> None:
 
 def test_distance_from_line_is_perpendicular() -> None:
     path = np.column_stack([np.linspace(0.0, 0.01, 50), np.zeros(50)])
-    beside = path + np.array([1e-4, 3e-6])
-    assert nc.measure_distance_um(path, beside, PERIOD_S)[10:40] == pytest.approx(np.full(30, 3.0))
+    adjacent = path + np.array([1e-4, 3e-6])
+    assert nc.measure_distance_um(path, adjacent, PERIOD_S)[10:40] == pytest.approx(np.full(30, 3.0))
 
 
 def test_same_seed_draws_same_machines_on_their_grid() -> None:

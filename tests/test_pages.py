@@ -20,8 +20,8 @@ Figures = dict[str, Any]
 
 
 def load_document(study: str) -> Figures:
-    told: Figures = json.loads((FOLDER / f"{study}.json").read_text("utf-8"))
-    return told
+    reported: Figures = json.loads((FOLDER / f"{study}.json").read_text("utf-8"))
+    return reported
 
 
 def extract_prose(page: str) -> str:
@@ -36,8 +36,8 @@ def test_page_matches_figures(study: str) -> None:
     assert render_page(figures) == page
     words = extract_prose(page)
     assert figures["study"] == study
-    for told in ("command", "seeds", "commit", "date"):
-        assert figures["run"][told] in words
+    for reported in ("command", "seeds", "commit", "date"):
+        assert figures["run"][reported] in words
     for library in ("Python", "numpy", "scipy", "numba"):
         assert f"{library} " in figures["run"]["versions"]
     assert "local changes" not in figures["run"]["commit"]

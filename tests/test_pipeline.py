@@ -59,17 +59,17 @@ def select_windows(outcomes: Sequence[Outcome]) -> list[Window]:
 
 
 def list_numbers(outcomes: Sequence[Outcome]) -> list[object]:
-    told: list[object] = []
+    reported: list[object] = []
     for outcome in outcomes:
         if isinstance(outcome, WindowOutcome):
             estimate = outcome.estimate
             assert estimate is not None
-            told += [view_bits(estimate.values), view_bits(estimate.covariance), repr(outcome.verdict)]
+            reported += [view_bits(estimate.values), view_bits(estimate.covariance), repr(outcome.verdict)]
         elif isinstance(outcome, ParameterSet):
-            told += [repr(outcome.parameters), view_bits(outcome.covariance), outcome.revision, outcome.windows]
+            reported += [repr(outcome.parameters), view_bits(outcome.covariance), outcome.revision, outcome.windows]
         else:
-            told.append(repr(outcome))
-    return told
+            reported.append(repr(outcome))
+    return reported
 
 
 def test_each_rapid_yields_one_window(config: MachineConfig) -> None:
@@ -326,12 +326,12 @@ def test_nothing_is_published_if_one_direction_is_refused(
         return outcome if window.direction > 0 else replace(outcome, verdict=Verdict(False, 90.0, (reason,)))
 
     monkeypatch.setattr("fdhil.pipeline.identified_loops.analyse_window", refuse_direction)
-    pipeline, told = AxisPipeline("X", config), []
+    pipeline, reported = AxisPipeline("X", config), []
     for k in range(1, 7):
         outcomes = pipeline.process_record(make_vertical_axis(config, k, 0.0))
-        told.append([type(o).__name__ for o in outcomes if isinstance(o, Notice | ParameterSet)])
+        reported.append([type(o).__name__ for o in outcomes if isinstance(o, Notice | ParameterSet)])
     # the first came before the other direction was known to be refused; then it is said once
-    assert told == [["ParameterSet"], [], ["Notice"], [], [], []]
+    assert reported == [["ParameterSet"], [], ["Notice"], [], [], []]
 
 
 def test_rapids_without_samples_are_bounded(config: MachineConfig) -> None:

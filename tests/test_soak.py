@@ -107,9 +107,9 @@ def test_goal_is_met_without_growth_over_required_time(
 
 def test_goal_is_not_met_without_real_hours(tmp_path: Path) -> None:
     build_samples(tmp_path / "week", 0.0, 252, 4.0, 1_000_000)
-    told = soak.evaluate_goal(soak.compute_figures(tmp_path / "week", per_day=False), [])
-    assert not told["met"]
-    assert "0 of 8 real hours" in told["figure"]
+    reported = soak.evaluate_goal(soak.compute_figures(tmp_path / "week", per_day=False), [])
+    assert not reported["met"]
+    assert "0 of 8 real hours" in reported["figure"]
 
 
 def test_real_hours_are_added_and_must_not_grow(tmp_path: Path) -> None:

@@ -67,12 +67,12 @@ def test_wrong_verdicts_are_counted_for_valid_and_faulty() -> None:
     counted = judging.count_by_kind(made, kinds)
     assert counted[judging.GOOD].wrong == [2]
     assert counted["stuck"].wrong == [4]
-    told = " ".join("\n".join(judging.describe_results(counted, kinds)).split())
-    assert "Good: 3 windows of 2 recordings, 1 windows refused (33.33%" in told
-    assert "1 windows are accepted with a null and its reason: 1 without L." in told
-    assert "Bad: 2 recordings, 1 accepted, 1 of them without a warning, 1 to harm" in told
-    assert "Judged wrongly, or without a warning, by seed: good 2; stuck 4." in told
-    assert "| stuck | B11 | 2 | 0.01 s | 1 | 1 | 1 | 50% | 1 StuckValue |" in told
+    reported = " ".join("\n".join(judging.describe_results(counted, kinds)).split())
+    assert "Good: 3 windows of 2 recordings, 1 windows refused (33.33%" in reported
+    assert "1 windows are accepted with a null and its reason: 1 without L." in reported
+    assert "Bad: 2 recordings, 1 accepted, 1 of them without a warning, 1 to harm" in reported
+    assert "Judged wrongly, or without a warning, by seed: good 2; stuck 4." in reported
+    assert "| stuck | B11 | 2 | 0.01 s | 1 | 1 | 1 | 50% | 1 StuckValue |" in reported
 
 
 def test_valid_recording_is_accepted_and_inverted_one_refused() -> None:

@@ -78,9 +78,9 @@ def load_model(told: dict[str, Any]) -> dict[str, Any]:
 def test_validated_model_is_used(plant: str, tmp_path: Path) -> None:
     result = identify_plant(PLANTS[plant])
     document = build_file_document(result, {}, with_loops=False)
-    told = [each for each in (*document["windows"], document["pooled"]) if each["validated"]]
+    reported = [each for each in (*document["windows"], document["pooled"]) if each["validated"]]
     path = tmp_path / "model.json"
-    for each in told:
+    for each in reported:
         path.write_text(json.dumps({"X": load_model(each)}))
         predict_path(MOVE, load_model_file(path).parameters, CONFIG)
     if not result.verdict.accepted or result.pooled is None:
@@ -97,8 +97,8 @@ def test_pool_with_slightly_negative_friction_is_used(tmp_path: Path) -> None:
     names = (*PARAMETERS, "stribeck", "stribeck_speed")
     values = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 4.95, -6.4, 8.0])
     covariance = np.diag([1e-8, 1e-10, 1e-8, 1e-10, 1e-6, 0.25, 2.8**2, 1.0])
-    told = Estimate("maximum_likelihood", names, values, covariance, {}, Result.OK)
-    outcomes = [WindowOutcome(window, told, Verdict(True, 99.0)) for window in simulate_rapids(moves=2)]
+    reported = Estimate("maximum_likelihood", names, values, covariance, {}, Result.OK)
+    outcomes = [WindowOutcome(window, reported, Verdict(True, 99.0)) for window in simulate_rapids(moves=2)]
     estimate, verdict = pool_windows(outcomes, Identification())
     assert verdict.accepted
     assert estimate is not None

@@ -50,9 +50,9 @@ class IterativeLearner:
         }
         path, table = (compute_table_path((*self.demand_mm,), rows) for rows in (planned, position_mm))
         left_um = compute_rms(compute_contour_error_um(path, table, period_s))
-        lesson = learn_from_pass(self.learned, error_um, left_um, self.models, self.config)
-        write_learned(self.path, lesson)
-        return lesson
+        learned = learn_from_pass(self.learned, error_um, left_um, self.models, self.config)
+        write_learned(self.path, learned)
+        return learned
 
 
 def apply_learned_offsets(

@@ -267,16 +267,16 @@ def serve_states(options: argparse.Namespace, hal: Any, linuxcnc: Any, component
     greeting = {"schema": SCHEMA, "axes": axes, "servo_period_s": period_ns * 1e-9}
     listeners = TcpBroadcast(options.host, options.port, _encode_line(greeting))
     tap = HalSampler(hal, component, len(axes), options.channel, options.thread)
-    teller, status = StatePublisher(axes, mm, period_ns), StatusReader(linuxcnc)
+    publisher, status = StatePublisher(axes, mm, period_ns), StatusReader(linuxcnc)
     component.ready()
     _log_line(f"publishes LinuxCNC's state at {options.host}:{listeners.port}")
     while True:
         status.poll_status()
         cycles = list(tap.read_cycles())
         if cycles:
-            teller.update_clock(cycles[-1].number, time.monotonic_ns())
+            publisher.update_clock(cycles[-1].number, time.monotonic_ns())
         listeners.send_lines(
-            b"".join(_encode_line(state) for cycle in cycles for state in teller.select_states(cycle, status.now))
+            b"".join(_encode_line(state) for cycle in cycles for state in publisher.select_states(cycle, status.now))
         )
         time.sleep(LOOK_S)
 

@@ -48,8 +48,8 @@ def analyse_files(
     first = 0
     try:
         with _create_process_pool() as executor:
-            crew = TaskPool[_Numbered, FileResult](executor, CHUNK, 2 * _count_cores())
-            for task, results in crew.run_tasks(work, enumerate(paths)):
+            pool = TaskPool[_Numbered, FileResult](executor, CHUNK, 2 * _count_cores())
+            for task, results in pool.run_tasks(work, enumerate(paths)):
                 progress(len(task))
                 ready |= {number: result for (number, _), result in zip(task, results, strict=True)}
                 while first in ready:

@@ -78,14 +78,16 @@ def ask_room(axis: str, unit: str) -> TravelRoom | None:
         f"How far may axis {axis} move from here, for a jog and for rapids, in {unit}? Back and forward, as: -20 200; "
         "Enter: not at all"
     )
-    said = ask_text(question)
-    words = said.split()
+    message = ask_text(question)
+    words = message.split()
     if not words:
         return None
     try:
         back, forward = map(float, words)
     except ValueError:
-        raise DriveFault(f"drive {axis}", f"{said!r} is not two numbers; the axis was not moved, start again") from None
+        raise DriveFault(
+            f"drive {axis}", f"{message!r} is not two numbers; the axis was not moved, start again"
+        ) from None
     return parse_room((back, forward))
 
 

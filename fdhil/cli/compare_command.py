@@ -184,10 +184,10 @@ def _show_comparison(document: Mapping[str, Any]) -> None:
         table = make_narrow_table(f"axis {axis}")
         for text in ("", *map(escape, files), "change"):
             table.add_column(text, justify="right")
-        for name, told in parameters.items():
-            change = told["change_percent"]
+        for name, reported in parameters.items():
+            change = reported["change_percent"]
             cells = [
-                format_cell(name, told[when]["value"], compute_half_width(told[when]), " ")
+                format_cell(name, reported[when]["value"], compute_half_width(reported[when]), " ")
                 for when in ("before", "after")
             ]
             table.add_row(

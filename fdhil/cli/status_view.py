@@ -134,12 +134,12 @@ def _describe_source(status: Mapping[str, Any]) -> str:
 
 def _describe_guard(guard: Mapping[str, Any]) -> str:
     # an old answer may be outdated
-    state, heard_s = str(guard.get("state", "absent")), guard.get("heard_s_ago")
-    if state == "absent" or heard_s is None:
+    state, received_s = str(guard.get("state", "absent")), guard.get("heard_s_ago")
+    if state == "absent" or received_s is None:
         return state
     if state == "lost":
-        return f"lost, last seen {_format_age(heard_s)} ago in state {guard.get('last_state')}"
-    return state if heard_s <= GUARD_LIVE_S else f"{state} at its last answer, {_format_age(heard_s)} ago"
+        return f"lost, last seen {_format_age(received_s)} ago in state {guard.get('last_state')}"
+    return state if received_s <= GUARD_LIVE_S else f"{state} at its last answer, {_format_age(received_s)} ago"
 
 
 def format_lateness(recent: Mapping[str, Any]) -> str:

@@ -48,7 +48,7 @@ class LearnedOffset:
 
 
 def learn_from_pass(
-    lesson: LearnedOffset,
+    offsets: LearnedOffset,
     error_um: Mapping[str, Float],
     rms_um: float,
     models: Mapping[str, Parameters],
@@ -59,19 +59,19 @@ def learn_from_pass(
     ``error_um`` (n,) per axis is target less measured position in each row of the program, ``rms_um`` the RMS of the
     pass' contour error. A pass worse than the last one without a learned offset discards it.
     """
-    curve = (*lesson.curve_um, rms_um)
-    learned = any(np.any(offset) for offset in lesson.offset_um.values())
-    without_um = lesson.without_um if learned else rms_um
+    curve = (*offsets.curve_um, rms_um)
+    learned = any(np.any(offset) for offset in offsets.offset_um.values())
+    without_um = offsets.without_um if learned else rms_um
     if rms_um > WORSE * without_um:
-        forgotten = {axis: np.zeros_like(u) for axis, u in lesson.offset_um.items()}
-        return LearnedOffset(forgotten, rms_um, CAUTION * lesson.gain, curve)
+        forgotten = {axis: np.zeros_like(u) for axis, u in offsets.offset_um.items()}
+        return LearnedOffset(forgotten, rms_um, CAUTION * offsets.gain, curve)
     worse = len(curve) > 1 and rms_um > WORSE * curve[-2]
-    gain = CAUTION * lesson.gain if worse else min(GAIN, TRUST * lesson.gain)
+    gain = CAUTION * offsets.gain if worse else min(GAIN, TRUST * offsets.gain)
     period_s = config.machine.sync_period_s
     taught = {}
     for axis, error in error_um.items():
         inverse = linear_loop.invert_loop(models[axis], config.axis[axis], period_s, error.size)
-        wanted = _filter_low_pass(KEPT * lesson.offset_um[axis] + gain * inverse.compute_offset(error), period_s)
+        wanted = _filter_low_pass(KEPT * offsets.offset_um[axis] + gain * inverse.compute_offset(error), period_s)
         bound = MOST_SHARE * get_allowed_um(config, axis)
         taught[axis] = np.clip(wanted, -bound, bound)
     return LearnedOffset(taught, without_um, gain, curve)

@@ -176,7 +176,7 @@ def _run_filter_bank(owns: Float, levels: Float, values: Float, places: Float, p
     """
     n, p, k = levels.shape
     likely, state, spread, lever = np.zeros(len(pairs)), np.zeros(k), np.zeros((k, k)), np.zeros(k)
-    root, rows, told = np.zeros((p, p)), np.zeros((p, k)), np.zeros(p)
+    root, rows, reported = np.zeros((p, p)), np.zeros((p, k)), np.zeros(p)
     for g in range(len(pairs)):
         walk, scatter = pairs[g, 0] ** 2, pairs[g, 1] ** 2
         state[:], spread[:] = 0.0, 0.0
@@ -191,18 +191,18 @@ def _run_filter_bank(owns: Float, levels: Float, values: Float, places: Float, p
                     for c in range(a):
                         left -= root[q, c] * root[a, c]
                     root[q, a] = math.sqrt(left) if a == q else left / root[a, a]
-                told[q] = values[j, q]
+                reported[q] = values[j, q]
                 for a in range(k):
                     rows[q, a] = levels[j, q, a]
                 for c in range(q):
-                    told[q] -= root[q, c] * told[c]
+                    reported[q] -= root[q, c] * reported[c]
                     for a in range(k):
                         rows[q, a] -= root[q, c] * rows[c, a]
-                told[q] /= root[q, q]
+                reported[q] /= root[q, q]
                 for a in range(k):
                     rows[q, a] /= root[q, q]
             for q in range(p):
-                size, off = 1.0, told[q]
+                size, off = 1.0, reported[q]
                 for a in range(k):
                     lever[a] = 0.0
                     for c in range(k):

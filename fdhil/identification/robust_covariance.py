@@ -100,16 +100,16 @@ def compute_robust_covariance(
     direction, at least the information.
     """
     root = compute_inverse_root(information)
-    power, foretold = np.zeros((2, root.shape[1], root.shape[1]))
+    power, predicted = np.zeros((2, root.shape[1], root.shape[1]))
     for own in scores:
         power += estimate_long_run_variance(own @ root)
     for slopes, innovations in rows:
-        foretold += _estimate_coloured_variance(
+        predicted += _estimate_coloured_variance(
             slopes @ root, _estimate_spectrum_root(innovations, find_fft_size(2 * len(slopes)))
         )
     share = SUMMED_LAGS / sum(len(own) for own in scores)
     power *= (1.0 + 2.9694 / 1.96 * min(share, 1.0)) ** 2
-    return root @ take_larger_variance(foretold, take_larger_variance(power, np.eye(len(power)))) @ root.T
+    return root @ take_larger_variance(predicted, take_larger_variance(power, np.eye(len(power)))) @ root.T
 
 
 def estimate_long_run_variance(scores: Float) -> Float:

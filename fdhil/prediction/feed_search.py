@@ -317,8 +317,8 @@ class _FeedRefinement:
         """Evaluate some shares times their factors and keep those within the tolerance; return their next factors."""
         tried = {k: min(1.0, self._share[k] * factor) for k, factor in factors.items()}
         reference, error_um = evaluate_feeds(self._source, self._share | tried, self._judge)
-        spoilt = _compute_time_spans(reference, self._find_violations(error_um)).values()
-        good = {k for k, span in _compute_time_spans(reference, tried).items() if not self._is_near(span, spoilt)}
+        corrupted = _compute_time_spans(reference, self._find_violations(error_um)).values()
+        good = {k for k, span in _compute_time_spans(reference, tried).items() if not self._is_near(span, corrupted)}
         further = {
             k: self._estimate_next_factor(tried[k] / self._share[k], self._error_um[k], error_um[k]) for k in good
         }

@@ -52,17 +52,17 @@ def read_learned(path: Path) -> LearnedOffset | None:
     return learned if offsets and finite and np.isfinite([learned.without_um, learned.gain]).all() else None
 
 
-def write_learned(path: Path, lesson: LearnedOffset) -> None:
+def write_learned(path: Path, learned: LearnedOffset) -> None:
     """Store learned offsets durably; the oldest of other programs are removed. Raises StoreError."""
     content = io.BytesIO()
     np.savez_compressed(
         content,
         schema=np.array(SCHEMA),
-        axes=np.array(list(lesson.offset_um)),
-        without_um=np.array(lesson.without_um),
-        gain=np.array(lesson.gain),
-        curve_um=np.array(lesson.curve_um[-MOST_PASSES:]),
-        **{f"offset_{axis}_um": offset for axis, offset in lesson.offset_um.items()},  # type: ignore[arg-type]
+        axes=np.array(list(learned.offset_um)),
+        without_um=np.array(learned.without_um),
+        gain=np.array(learned.gain),
+        curve_um=np.array(learned.curve_um[-MOST_PASSES:]),
+        **{f"offset_{axis}_um": offset for axis, offset in learned.offset_um.items()},  # type: ignore[arg-type]
     )
     try:
         make_folder(path.parent)

@@ -38,8 +38,8 @@ LEFT_SHARE = 0.01
 def find_interruptions(signals: WindowSignals) -> Iterator[Reason]:
     """Yield the reason why the window is not a complete rapid, with the figure that shows it."""
     window = signals.window
-    if window.nc is not None and (said := _read_nc_report(window.nc)) is not None:
-        yield Reason(CODE, said, NC_ADVICE)
+    if window.nc is not None and (message := _read_nc_report(window.nc)) is not None:
+        yield Reason(CODE, message, NC_ADVICE)
         return
     a, b = (min(row, window.n) for row in signals.motion_range)
     speed = _differentiate_position(window.position_mm, window)

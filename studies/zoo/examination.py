@@ -57,8 +57,8 @@ def examine_machine(kind: Kind, seed: int) -> dict[str, Any]:
         )  # fmt: skip
         files = {document["axis"]: document for document in identified["files"]}
         found = {name: _examine_axis(files[name], axis, columns[name]) for name, axis in axes.items()}
-        believed = all(axis["pool"] for axis in found.values())
-        corrected = _assess_correction(place, axes, place / "model.json") if believed else dict(NOTHING)
+        accepted = all(axis["pool"] for axis in found.values())
+        corrected = _assess_correction(place, axes, place / "model.json") if accepted else dict(NOTHING)
         all_the_same = None
         if corrected["refused"] and (model := _build_refused_model(files, axes)) is not None:
             (place / "refused.json").write_text(json.dumps(model), "utf-8")
@@ -90,14 +90,14 @@ def _run_command(*words: str) -> dict[str, Any]:
 def _examine_axis(document: Mapping[str, Any], axis: Axis, columns: Mapping[str, Array]) -> dict[str, Any]:
     """Return the results of one axis: windows, errors of the pool, errors of the other methods."""
     truth, windows, pooled = axis.truth(), document["windows"], document["pooled"]
-    believed = [window for window in windows if window["validated"]]
+    accepted = [window for window in windows if window["validated"]]
     return {
         "moves": 2 * len(axis.kind.rapids.lengths),
         "windows": len(windows),
-        "believed": len(believed),
+        "believed": len(accepted),
         "pool": pooled["validated"],
         "errors": _compute_errors(pooled["parameters"], truth),
-        "window_errors": [_compute_errors(window["parameters"], truth) for window in believed],
+        "window_errors": [_compute_errors(window["parameters"], truth) for window in accepted],
         "reasons": _count_codes([r for window in windows for r in window["reasons"]]),
         "pool_reasons": [] if pooled["validated"] else _count_codes(pooled["reasons"]),
         "unexplained_um": pooled["unexplained_um"],

@@ -24,13 +24,13 @@ def page(run: pages.Run, figures: Figures) -> str:
     """Return the study's page."""
     axes = [axis for machine in figures for axis in machine["axes"].values()]
     sent = [m["correction"] for m in figures if not m["correction"]["refused"]]
-    moves, believed = sum(a["moves"] for a in axes), sum(a["believed"] for a in axes)
+    moves, accepted = sum(a["moves"] for a in axes), sum(a["believed"] for a in axes)
     kept = sum(_compare_predicted_gain(c) <= MOST_PROMISED for c in sent)
     harmed = [c["worse_um"] for c in sent if c["worse_um"] > HARM_UM]
     wrong = [name for m in figures if (name := _list_wrong_parameters(m))]
     lines = pages.write_head("A zoo of machines by an independent hand", "zoo", run)
     lines += wrap_paragraph(
-        f"""{len(figures)} machines of two axes: {believed} of {moves} recorded moves and
+        f"""{len(figures)} machines of two axes: {accepted} of {moves} recorded moves and
         {sum(a["pool"] for a in axes)} of {len(axes)} pools are validated. {len(wrong)} machines are wrong and confident
         (a validated parameter off by more than {WRONG_DEVIATIONS:g} standard deviations and
         {100 * WRONG_SHARE:g} %). {len(sent)} corrections are not refused: the predicted gain is at most

@@ -99,8 +99,8 @@ def output_error(columns: Columns, period_s: float) -> Found:
 
     def residual(logs: Array) -> Array:
         with np.errstate(all="ignore"):
-            told = _simulated(*_matrices(start * np.exp(np.clip(logs, -3, 3))), inputs, period_s)
-        return np.nan_to_num(((told - seen) / scale).ravel(), nan=1e3, posinf=1e3, neginf=-1e3)
+            reported = _simulated(*_matrices(start * np.exp(np.clip(logs, -3, 3))), inputs, period_s)
+        return np.nan_to_num(((reported - seen) / scale).ravel(), nan=1e3, posinf=1e3, neginf=-1e3)
 
     found = least_squares(residual, np.zeros(6), method="trf", loss="soft_l1", f_scale=0.02, max_nfev=12)
     return dict(zip(NAMES, map(float, start * np.exp(np.clip(found.x, -3, 3))), strict=True))

@@ -39,9 +39,9 @@ def run_check_process(request: bytes, errors: Path) -> bytes:
         process.stdin.flush()
         answer = process.stdout.read()
         assert process.wait() == 0
-    said = errors.read_text().splitlines()
-    assert [line for line in said if not line.startswith("import time:")] == []
-    _assert_covered_by_digest({line.rsplit("|", 1)[1].strip() for line in said})
+    message = errors.read_text().splitlines()
+    assert [line for line in message if not line.startswith("import time:")] == []
+    _assert_covered_by_digest({line.rsplit("|", 1)[1].strip() for line in message})
     return answer
 
 

@@ -105,10 +105,10 @@ def test_all_facts_hold_for_a_good_machine(config: MachineConfig, program: Path)
     armament = make_whole_plan(program, config)
     assert isinstance(armament, ArmPlan)
     assert all(armament.facts.values()), armament.facts
-    told = armament.summarise()
-    assert told["after"]["rms_um"] < 0.2 * told["before"]["rms_um"]
-    assert told["program_digest"] == compute_program_digest(program)
-    assert told["rows"] == len(armament.first_piece.offset["X"])
+    reported = armament.summarise()
+    assert reported["after"]["rms_um"] < 0.2 * reported["before"]["rms_um"]
+    assert reported["program_digest"] == compute_program_digest(program)
+    assert reported["rows"] == len(armament.first_piece.offset["X"])
     assert armament.first_piece.final
 
 
@@ -208,25 +208,27 @@ async def test_wrong_token_is_refused_and_missing_guard_reported(config: Machine
     store = OutcomeStore(config)
     assert config.store.run_directory is not None
     config.store.run_directory.mkdir(parents=True)
-    desk = ArmingService(config, store, config.store.run_directory)
+    service = ArmingService(config, store, config.store.run_directory)
     stamp = TimeStamp(0.0, "another boot", 0)
     newest = replace(make_published(), config_digest=config.digest)
     skills = [Skill(axis, 1, 0.5, 1.0, 0.0, 30.0) for axis in ("X", "Y")]
-    desk.start_from_history({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
+    service.start_from_history(
+        {axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills
+    )
     request = {"request": "arm", "program": str(program)}
     for token in (None, "", 5, "wrong", "ä"):
-        answer = await desk.arm(request | {"token": token})
+        answer = await service.arm(request | {"token": token})
         assert (answer["ok"], answer["code"]) == (False, "AuthRequired")
     token = read_token(config.store.run_directory)
     meant = {"token": token, "program_digest": compute_program_digest(program)}
-    assert (await desk.arm(request | meant))["code"] == "GuardAbsent"
+    assert (await service.arm(request | meant))["code"] == "GuardAbsent"
     program.write_bytes(program.read_bytes() + b"\n")
-    assert (await desk.arm(request | meant))["code"] == "ProgramMismatch"
-    assert (await desk.arm(request | {"token": token}))["code"] == "GuardAbsent"
-    assert (await desk.arm(request | {"token": token, "method": "magic"}))["code"] == "BadRequest"
-    assert (await desk.arm({"request": "arm", "token": token}))["code"] == "BadRequest"
-    assert (await desk.disarm())["code"] == "GuardAbsent"
-    assert not (await desk.shut_down()).guard_seen
+    assert (await service.arm(request | meant))["code"] == "ProgramMismatch"
+    assert (await service.arm(request | {"token": token}))["code"] == "GuardAbsent"
+    assert (await service.arm(request | {"token": token, "method": "magic"}))["code"] == "BadRequest"
+    assert (await service.arm({"request": "arm", "token": token}))["code"] == "BadRequest"
+    assert (await service.disarm())["code"] == "GuardAbsent"
+    assert not (await service.shut_down()).guard_seen
 
 
 @pytest.mark.timeout(100)
@@ -260,12 +262,12 @@ def test_program_that_grows_while_it_is_read_is_refused(tmp_path: Path, monkeypa
 
 
 def test_changed_load_holds_until_new_parameters(config: MachineConfig, tmp_path: Path) -> None:
-    desk = ArmingService(config, OutcomeStore(config), tmp_path)
-    desk.knowledge.take_outcomes([replace(make_published(), config_digest=config.digest)])
-    desk.knowledge.take_outcomes([Notice("LoadChanged", "MAJOR", "Jt rose", "X")])
-    assert desk.knowledge.get_states()["X"].load_changed
-    desk.knowledge.take_outcomes([replace(make_published(2), config_digest=config.digest)])
-    assert not desk.knowledge.get_states()["X"].load_changed
+    service = ArmingService(config, OutcomeStore(config), tmp_path)
+    service.knowledge.take_outcomes([replace(make_published(), config_digest=config.digest)])
+    service.knowledge.take_outcomes([Notice("LoadChanged", "MAJOR", "Jt rose", "X")])
+    assert service.knowledge.get_states()["X"].load_changed
+    service.knowledge.take_outcomes([replace(make_published(2), config_digest=config.digest)])
+    assert not service.knowledge.get_states()["X"].load_changed
 
 
 def test_model_ages_while_computer_is_suspended(config: MachineConfig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -278,9 +280,9 @@ def test_model_ages_while_computer_is_suspended(config: MachineConfig, monkeypat
 
 
 def test_accepted_identified_loops_are_used_in_plan(config: MachineConfig, program: Path) -> None:
-    believed = Verdict(True, None, unexplained_um=0.5, warnings=(Reason(DIFFER, "speed_kp is 21"),))
+    accepted = Verdict(True, None, unexplained_um=0.5, warnings=(Reason(DIFFER, "speed_kp is 21"),))
     loops = LoopEstimate(
-        "X", "p_pi_pi", ("speed_kp", "speed_filter_s"), np.array([21.0, 5e-4]), np.zeros((2, 2)), believed
+        "X", "p_pi_pi", ("speed_kp", "speed_filter_s"), np.array([21.0, 5e-4]), np.zeros((2, 2)), accepted
     )
     knowledge = ModelTracker(config.axis)
     knowledge.take_outcomes([replace(make_published(1, axis), config_digest=config.digest) for axis in "XY"])
@@ -289,7 +291,7 @@ def test_accepted_identified_loops_are_used_in_plan(config: MachineConfig, progr
     assert found.axis["X"].regulators.speed_kp == 21.0
     assert found.axis["X"].regulators.speed_filter_s == 5e-4
     assert found.axis["Y"] == config.axis["Y"]
-    knowledge.take_outcomes([replace(loops, verdict=replace(believed, accepted=False))])
+    knowledge.take_outcomes([replace(loops, verdict=replace(accepted, accepted=False))])
     assert make_own_config(config, knowledge) is config
     request = prepare_request(program, None, config, make_model_states(config, loops=loops))
     assert isinstance(request, ArmRequest)

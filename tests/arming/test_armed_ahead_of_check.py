@@ -112,20 +112,22 @@ class ArmingRig:
 @asynccontextmanager
 async def open_service(config: MachineConfig, mill: MachinePeer) -> AsyncIterator[ArmingRig]:
     assert config.store.run_directory is not None
-    desk = ArmingService(config, OutcomeStore(config), config.store.run_directory)
+    service = ArmingService(config, OutcomeStore(config), config.store.run_directory)
     stamp = TimeStamp(0.0, "another boot", 0)
     newest = replace(make_published(), config_digest=config.digest, temperature_c=None)
     skills = [Skill(axis, 1, 0.5, 1.0, 0.0, 30.0) for axis in ("X", "Y")]
-    desk.start_from_history({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
+    service.start_from_history(
+        {axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills
+    )
     for axis in ("X", "Y"):
-        desk.knowledge.take_outcomes([replace(newest, axis=axis)])
-    told: list[Notice] = []
-    tasks = [asyncio.create_task(work(told.extend)) for work in (desk.supervise_guard, desk.stream_rows)]
+        service.knowledge.take_outcomes([replace(newest, axis=axis)])
+    reported: list[Notice] = []
+    tasks = [asyncio.create_task(work(reported.extend)) for work in (service.supervise_guard, service.stream_rows)]
     try:
-        yield ArmingRig(desk, mill, read_token(config.store.run_directory), told)
+        yield ArmingRig(service, mill, read_token(config.store.run_directory), reported)
         assert not any(task.done() for task in tasks)
     finally:
-        await desk.shut_down()
+        await service.shut_down()
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -382,7 +384,7 @@ def test_check_falling_behind_twice_is_reported_twice(
     assert config.store.run_directory is not None
     feeder, link = make_feeder(checked, machine_peer, config.store.run_directory)
     machine_peer.state = "ACTIVE"
-    told = []
+    reported = []
     for row, end in ((0, 10_000), (3_000, 10_000), (4_500, 10_000), (4_600, 10_000), (4_600, 14_000), (3_900, 14_000),
                      (7_500, 14_000), (8_500, 14_000)):  # fmt: skip
         if end > checked.row_count:
@@ -390,9 +392,9 @@ def test_check_falling_behind_twice_is_reported_twice(
         machine_peer.row = row
         if not machine_peer.rows:
             assert link.extend_stream(feeder._armed, feeder._armed.stream.take_rows())["ok"]
-        told.append([notice.code for notice in feeder.feed_rows() if notice.severity == "MAJOR"])
+        reported.append([notice.code for notice in feeder.feed_rows() if notice.severity == "MAJOR"])
     behind = ["CheckBehind"]
-    assert told == [[], [], behind, [], [], [], [], behind]
+    assert reported == [[], [], behind, [], [], [], [], behind]
     assert len(machine_peer.rows) == 14_000
     link.close()
 

@@ -161,9 +161,9 @@ def test_missing_settings_or_descriptor_is_reported(
     assert start_guard(monkeypatch, "--settings", str(file), "--descriptor", "0") == 2
     file.write_text(encode_settings(settings(run_directory=str(tmp_path))))
     assert start_guard(monkeypatch, "--settings", str(file), "--descriptor", str(1 << 20)) == 3
-    told = capsys.readouterr().err.splitlines()
-    assert "run fdhil-guard" in told[0]
-    assert "start the guard with fdhil-guard" in told[1]
+    reported = capsys.readouterr().err.splitlines()
+    assert "run fdhil-guard" in reported[0]
+    assert "start the guard with fdhil-guard" in reported[1]
     with pytest.raises(SystemExit, match="3"):
         runpy.run_path(str(entry.__file__), run_name="__main__")
 

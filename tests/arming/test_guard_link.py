@@ -91,15 +91,15 @@ async def test_slow_guard_still_receives_alive(
 ) -> None:
     monkeypatch.setattr("fdhil.arming.guard_link.GuardClient", partial(GuardClient, timeout_s=100.0))
     guard.says = lambda _kind: None
-    desk = ArmingService(config, OutcomeStore(config), folder)
-    attending = asyncio.create_task(desk.supervise_guard(lambda _told: None))
+    service = ArmingService(config, OutcomeStore(config), folder)
+    attending = asyncio.create_task(service.supervise_guard(lambda _told: None))
     async with asyncio.timeout(60.0):
         while guard.heard.count("alive") < 20:  # noqa: ASYNC110 - it is another thread that hears
             await asyncio.sleep(ALIVE_S)
     assert [kind for kind in guard.heard if kind != "alive"] == ["status"]
     attending.cancel()
     guard.close()
-    await asyncio.to_thread(desk.guard.close)
+    await asyncio.to_thread(service.guard.close)
 
 
 @pytest.mark.parametrize("how", ["disarm", "abandon", "hang up"])
@@ -124,39 +124,39 @@ async def test_abandoned_program_is_not_armed(
     monkeypatch.setattr("fdhil.arming.arming_service.apply_learned_offsets", lambda *_: (None, None))
     monkeypatch.setattr("fdhil.arming.arming_service.prepare_program", slow)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
-    desk = ArmingService(config, OutcomeStore(config), folder)
-    desk.start_from_history({}, [])
+    service = ArmingService(config, OutcomeStore(config), folder)
+    service.start_from_history({}, [])
     request = {"request": "arm", "program": "a.ngc", "token": read_token(folder)}
     hung_up = threading.Event()
-    arming = asyncio.create_task(desk.arm(request, hung_up.is_set))
+    arming = asyncio.create_task(service.arm(request, hung_up.is_set))
     assert await asyncio.to_thread(planning.wait, 60.0)
     if how == "disarm":
-        await desk.disarm()
+        await service.disarm()
     elif how == "abandon":
-        desk.abandon_preparation()
+        service.abandon_preparation()
     else:
         hung_up.set()
     planned.set()
     answer = await arming
     assert (answer["ok"], answer["code"]) == (False, "Abandoned")
     assert set(guard.heard) <= {"disarm", "status"}
-    assert desk.armed is None
-    desk.guard.close()
+    assert service.armed is None
+    service.guard.close()
 
 
 @pytest.mark.fault("E18")
 async def test_disarm_does_not_wait_for_disk(config: MachineConfig, guard: GuardPeer, folder: Path) -> None:
     """Every thread of asyncio's pool waits for the disk, as with pending axes, history, notices and requests."""
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
-    desk, answers = ArmingService(config, OutcomeStore(config), folder), threading.Event()
+    service, answers = ArmingService(config, OutcomeStore(config), folder), threading.Event()
     waiting = [asyncio.create_task(asyncio.to_thread(answers.wait, 60.0)) for _ in range(40)]
     try:
         await asyncio.sleep(0)
-        assert (await asyncio.wait_for(desk.disarm(), 30.0))["ok"]
+        assert (await asyncio.wait_for(service.disarm(), 30.0))["ok"]
     finally:
         answers.set()
         await asyncio.gather(*waiting)
-        desk.guard.close()
+        service.guard.close()
 
 
 @pytest.mark.parametrize(
@@ -170,10 +170,10 @@ async def test_disarm_does_not_wait_for_disk(config: MachineConfig, guard: Guard
 async def test_invalid_program_or_token_text_is_refused(
     asked: Mapping[str, str], code: str, config: MachineConfig, folder: Path
 ) -> None:
-    desk = ArmingService(config, OutcomeStore(config), folder)
-    desk.start_from_history({}, [])
+    service = ArmingService(config, OutcomeStore(config), folder)
+    service.start_from_history({}, [])
     request = {"request": "arm", "program": "a.ngc", "token": read_token(folder), **asked}
-    assert (await desk.arm(request))["code"] == code
+    assert (await service.arm(request))["code"] == code
 
 
 async def test_disarm_during_preparation_prevents_arming(
@@ -182,41 +182,41 @@ async def test_disarm_during_preparation_prevents_arming(
     feeding = SimpleNamespace(laws={}, facts={}, summarise=dict, report_progress=dict)
     monkeypatch.setattr("fdhil.arming.arming_service.prepare_feedforward", lambda *_: feeding)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
-    desk = ArmingService(config, OutcomeStore(config), folder)
-    desk.start_from_history({}, [])
-    asked, disarmed, feed_forward = threading.Event(), threading.Event(), desk.guard.enable_feedforward
+    service = ArmingService(config, OutcomeStore(config), folder)
+    service.start_from_history({}, [])
+    asked, disarmed, feed_forward = threading.Event(), threading.Event(), service.guard.enable_feedforward
 
     def its_turn_comes_late(*given: Any) -> Any:
         asked.set()
         assert disarmed.wait(60.0)
         return feed_forward(*given)
 
-    monkeypatch.setattr(desk.guard, "enable_feedforward", its_turn_comes_late)
-    arming = asyncio.create_task(desk.arm({"request": "arm", "method": "flatness", "token": read_token(folder)}))
+    monkeypatch.setattr(service.guard, "enable_feedforward", its_turn_comes_late)
+    arming = asyncio.create_task(service.arm({"request": "arm", "method": "flatness", "token": read_token(folder)}))
     assert await asyncio.to_thread(asked.wait, 60.0)
-    assert (await desk.disarm())["ok"]
+    assert (await service.disarm())["ok"]
     disarmed.set()
     assert (await arming)["code"] == "Abandoned"
     assert "feedforward" not in guard.heard
-    desk.guard.close()
+    service.guard.close()
 
 
 async def test_arm_request_carries_disarm_count(
     config: MachineConfig, guard: GuardPeer, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    desk = ArmingService(config, OutcomeStore(config), folder)
-    desk.start_from_history({}, [])
+    service = ArmingService(config, OutcomeStore(config), folder)
+    service.start_from_history({}, [])
     disarms, of_its_time = 4, SimpleNamespace(laws={}, facts={}, summarise=dict, report_progress=dict)
 
     def planned(*_: object) -> Any:
         nonlocal disarms
         disarms += 1
-        desk.guard.read_status()
+        service.guard.read_status()
         return of_its_time
 
     monkeypatch.setattr("fdhil.arming.arming_service.prepare_feedforward", planned)
     guard.says = lambda _kind: {**FINE, "state": "OFF", "disarms": disarms}
-    await desk.arm({"request": "arm", "method": "flatness", "token": read_token(folder)})
+    await service.arm({"request": "arm", "method": "flatness", "token": read_token(folder)})
     asked = next(request for request in guard.requests if request["request"] == "feedforward")
     assert asked["disarms"] == 4
-    desk.guard.close()
+    service.guard.close()

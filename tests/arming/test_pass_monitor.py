@@ -70,19 +70,19 @@ def test_measured_error_is_independent_of_block_sizes(
         samples = sorted(make_samples(reference.position_mm, after.predicted_mm), key=lambda block: int(block.tick[-1]))
         for block in samples:
             running.take_samples(block)
-        told = running.measure_errors()
-        assert told is not None
+        reported = running.measure_errors()
+        assert reported is not None
         path, is_at = (np.column_stack([of[a] for a in "XY"]) for of in (reference.position_mm, after.predicted_mm))
         error = compute_contour_error_um(path, is_at, reference.dt_s)
-        assert told["measured"]["max_um"] == pytest.approx(float(error.max()), rel=1e-6)
+        assert reported["measured"]["max_um"] == pytest.approx(float(error.max()), rel=1e-6)
         if rows is not None:
-            assert told["rows"] == rows
-            assert told["measured"]["rms_um"] == pytest.approx(after.rms_um, rel=1e-6)
+            assert reported["rows"] == rows
+            assert reported["measured"]["rms_um"] == pytest.approx(after.rms_um, rel=1e-6)
             assert arm_plan.predicted_gain.after_um > after.rms_um  # held-out moves are predicted worse
             lag = (after.predicted_mm["X"] - reference.position_mm["X"]) * 1e3
-            assert told["following_rms_um"]["X"] == pytest.approx(float(np.sqrt(np.mean(lag**2))), rel=1e-6)
+            assert reported["following_rms_um"]["X"] == pytest.approx(float(np.sqrt(np.mean(lag**2))), rel=1e-6)
         else:
-            assert told["rows"] >= arm_plan.row_count
+            assert reported["rows"] >= arm_plan.row_count
 
 
 def test_pass_that_never_began_measures_nothing(config: MachineConfig, arm_plan: ArmPlan, planned: Correction) -> None:
@@ -125,10 +125,10 @@ async def test_each_pass_is_reported_with_its_prediction(
                 shop.desk.take_samples(block)
             machine_peer.state, machine_peer.cause = "OFF", cause
             await shop.wait_until(partial(measure_pass, shop.told, number))
-            told = shop.desk.passes[-1]
+            reported = shop.desk.passes[-1]
             notice = next(notice for notice in reversed(shop.told) if notice.code == "PassMeasured")
-            assert (notice.severity, notice.text.startswith(told["text"])) == (severity, True)
-            assert (told["pass"], told["ended_by"]) == (number, cause)
+            assert (notice.severity, notice.text.startswith(reported["text"])) == (severity, True)
+            assert (reported["pass"], reported["ended_by"]) == (number, cause)
         refused = await shop.arm(program)
     assert (refused["ok"], refused["code"]) == (False, "PromiseBroken"), refused
     first, third, second = shop.desk.passes
@@ -196,9 +196,9 @@ def test_table_behind_known_compliance_is_measured_at_table(
         running = ProgramPass(config, arm_plan.first_piece.demand, arm_plan.row_count, None, known)
         for block in sorted(make_samples(reference.position_mm, motor), key=lambda block: int(block.tick[-1])):
             running.take_samples(block)
-        told = running.measure_errors()
-        assert told is not None
-        assert 0.1 * largest_um * (known is None) <= told["measured"]["max_um"] <= largest_um
+        reported = running.measure_errors()
+        assert reported is not None
+        assert 0.1 * largest_um * (known is None) <= reported["measured"]["max_um"] <= largest_um
 
 
 @pytest.mark.parametrize(

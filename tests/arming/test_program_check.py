@@ -52,17 +52,17 @@ def write_program(folder: Path, text: str) -> Path:
 
 
 def run_check(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Any]]:
-    body, told = io.BytesIO(), list[Any]()
+    body, reported = io.BytesIO(), list[Any]()
     header = check_program(
-        program, compute_program_digest(program), build_nominal_models(config), config, body, told.append
+        program, compute_program_digest(program), build_nominal_models(config), config, body, reported.append
     )
-    return header, body.getvalue(), told
+    return header, body.getvalue(), reported
 
 
 @pytest.mark.usefixtures("long_computation")
 def test_checked_rows_equal_whole_plan(config: MachineConfig, tmp_path: Path) -> None:
     program = write_program(tmp_path, LONG)
-    header, body, told = run_check(program, config)
+    header, body, reported = run_check(program, config)
     planned = correction.plan_correction(
         load_trajectory(program, config), build_nominal_models(config), config, "inverse"
     )
@@ -72,9 +72,9 @@ def test_checked_rows_equal_whole_plan(config: MachineConfig, tmp_path: Path) ->
     assert header["rows"] == len(rows)
     assert header["before"]["rms_um"] == pytest.approx(np.sqrt(np.mean(planned.before.contour_um**2)))
     assert header["after"]["max_um"] == pytest.approx(planned.after.contour_um.max(), abs=1e-6)
-    progress = next(one["progress"] for one in told if "progress" in one)
+    progress = next(one["progress"] for one in reported if "progress" in one)
     assert progress.keys() == {"checked_s", "line", "times_real_time", "refused"}
-    blocks = [one for one in told if "block" in one]
+    blocks = [one for one in reported if "block" in one]
     assert [one["block"] for one in blocks] == header["blocks"]
     assert [one["last"] for one in blocks] == [False] * (len(blocks) - 1) + [True]
     assert blocks[-1]["errors"] == {"before": header["before"], "after": header["after"]}
@@ -117,9 +117,9 @@ def test_every_refusal_names_line_axis_figure_and_advice(config: MachineConfig, 
     assert [one["refused"] for one in at_once if "refused" in one] == header["refused"]
     assert len(body) == 16 * header["blocks"][-1][0] < 16 * header["rows"]  # no row from the first place on
     demand = [told for told in header["refused"] if told["code"] == "DemandTooHigh"]
-    told = " | ".join(reason["text"] for reason in demand)
+    reported = " | ".join(reason["text"] for reason in demand)
     for number in HARD_LINES:
-        assert f"line {number}," in told or f"line {number + 1}," in told, told
+        assert f"line {number}," in reported or f"line {number + 1}," in reported, reported
     assert all(re.search(r"axis [XY] is at", one["text"]) for one in demand)
     assert all(" ms: no offset can help" in one["text"] and one["advice"] for one in demand)
 
@@ -162,21 +162,21 @@ def read_all_rows(_checked: CheckedProgram) -> bool:
 
 
 async def _check_twice(config: MachineConfig, found: ArmRequest) -> list[CheckedProgram | tuple[Reason, ...]]:
-    check, heard = BackgroundCheck(config), list[Mapping[str, Any]]()
+    check, received = BackgroundCheck(config), list[Mapping[str, Any]]()
 
     async def count_messages() -> None:
         while True:
             if check.progress is not None:
-                heard.append(check.progress)
+                received.append(check.progress)
             await asyncio.sleep(0.01)
 
     listening = asyncio.create_task(count_messages())
     first = await check.check_until(found.program, found.program_digest, found.models, read_all_rows)
-    before = len(heard)
+    before = len(received)
     again = await check.check_until(found.program, found.program_digest, found.models, read_all_rows)
     listening.cancel()
-    assert heard[-1]["program"] == str(found.program)
-    assert len(heard) == before
+    assert received[-1]["program"] == str(found.program)
+    assert len(received) == before
     return [first, again]
 
 
@@ -205,28 +205,28 @@ BESIDE = "O<square> SUB\n" + SQUARE + "O<square> ENDSUB\n"
 
 @pytest.mark.usefixtures("processes")
 async def test_subroutine_in_program_folder_is_part_of_check(config: MachineConfig, tmp_path: Path) -> None:
-    beside = tmp_path / "square.ngc"
-    beside.write_text(BESIDE)
+    adjacent = tmp_path / "square.ngc"
+    adjacent.write_text(BESIDE)
     program = write_program(tmp_path, CALLS)
     digest, models = compute_program_digest(program), build_nominal_models(config)
     folder, key = config.store.directory / FOLDER, BackgroundCheck(config)._make_key(digest, models, config)
     header = store_checked(
         folder, key, lambda body: check_program(program, digest, models, config, body, lambda _told: None)
     )
-    assert header["files"] == {"square.ngc": compute_program_digest(beside)}
+    assert header["files"] == {"square.ngc": compute_program_digest(adjacent)}
     first = await BackgroundCheck(config).check_until(program, digest, models, read_all_rows)
     assert isinstance(first, CheckedProgram)
     assert [list(block[:2]) for block in first.blocks] == header["blocks"]  # it is known
     (file,) = folder.glob("*.rows")
     assert CheckedProgram.find_checked(file.parent, file.stem, tmp_path) is not None
-    beside.write_text(BESIDE.replace("X40", "X41"))
+    adjacent.write_text(BESIDE.replace("X40", "X41"))
     assert CheckedProgram.find_checked(file.parent, file.stem, tmp_path) is None
     again = await BackgroundCheck(config).check_until(program, digest, models, read_all_rows)
     assert isinstance(again, CheckedProgram)
     assert again.blocks != first.blocks
     assert again.header is not None
-    assert again.header["files"] == {"square.ngc": compute_program_digest(beside)}
-    beside.unlink()
+    assert again.header["files"] == {"square.ngc": compute_program_digest(adjacent)}
+    adjacent.unlink()
     assert CheckedProgram.find_checked(file.parent, file.stem, tmp_path) is None
 
 

@@ -102,10 +102,10 @@ def test_residual_offset_of_dead_guard_stays_until_adopted(guard: GuardPeer, fol
     link = GuardLink(folder, folder)
     link.poll_changes()
     guard.close()
-    told = link.poll_changes()
+    reported = link.poll_changes()
     expected = "-38 um on axis X and an unknown offset on axis Y may still be applied"
-    assert [(n.code, n.severity, expected in n.text) for n in told] == [("GuardLost", "MAJOR", True)]
-    assert "run fdhil adopt" in told[0].text
+    assert [(n.code, n.severity, expected in n.text) for n in reported] == [("GuardLost", "MAJOR", True)]
+    assert "run fdhil adopt" in reported[0].text
     assert (link.state, str(link.residual_offset), link.poll_changes()) == ("lost", expected, [])
     assert "nothing is sent" not in json.dumps(link.status)
     (folder / "guard.sock").unlink()
@@ -159,9 +159,9 @@ def test_next_daemon_reads_residual_offset_from_store(tmp_path: Path, folder: Pa
         (tmp_path / FILE_NAME).write_text(kept)
     after = GuardLink(folder, tmp_path)
     assert (after.state, after.residual_offset.is_zero) == ("lost", False)
-    told = after.poll_changes()
-    assert [(n.code, n.severity, "an unknown offset" in n.text) for n in told] == [("GuardLost", "MAJOR", True)]
-    assert "start fdhil-guard, then run fdhil adopt" in told[0].text
+    reported = after.poll_changes()
+    assert [(n.code, n.severity, "an unknown offset" in n.text) for n in reported] == [("GuardLost", "MAJOR", True)]
+    assert "start fdhil-guard, then run fdhil adopt" in reported[0].text
     assert after.poll_changes() == []
     assert "an unknown offset" in after.status["text"]
     found = GuardPeer(folder)
@@ -195,29 +195,29 @@ def test_frozen_offset_is_reported_by_next_daemon(tmp_path: Path, folder: Path) 
 async def test_disarm_is_ok_only_at_zero(config: MachineConfig, guard: GuardPeer, folder: Path) -> None:
     ramp = iter([{**ACTIVE, "state": "RAMP_DOWN"}] * 3)
     guard.says = lambda kind: OFF if kind == "disarm" else next(ramp, OFF)
-    desk = ArmingService(config, OutcomeStore(config), folder)
-    assert await desk.disarm() == {
+    service = ArmingService(config, OutcomeStore(config), folder)
+    assert await service.disarm() == {
         "ok": True,
         "text": "guard: OFF, offset 0",
         "state": "OFF",
         "may_stand_um": {"X": 0.0, "Y": 0.0},
     }
     guard.says = lambda _kind: FROZEN
-    answer = await desk.disarm()
+    answer = await service.disarm()
     assert (answer["ok"], answer["code"], answer["state"]) == (False, "OffsetStands", "FROZEN")
     assert answer["text"] == f"the guard is FROZEN (the CAN controller is bus-off): {STANDS}"
     assert "run fdhil adopt" in answer["advice"]
-    desk.guard.close()
+    service.guard.close()
 
 
 async def test_disarm_without_zero_is_refused(config: MachineConfig, guard: GuardPeer, folder: Path) -> None:
     guard.says = lambda _kind: {**ACTIVE, "state": "RAMP_DOWN"}
-    desk = ArmingService(config, OutcomeStore(config), folder, ImpatientClock())
-    answer = await desk.disarm()
+    service = ArmingService(config, OutcomeStore(config), folder, ImpatientClock())
+    answer = await service.disarm()
     assert (answer["ok"], answer["state"]) == (False, "RAMP_DOWN")
     assert "-38 um on axis X" in answer["text"]
     guard.close()
-    answer = await desk.disarm()
+    answer = await service.disarm()
     assert (answer["ok"], answer["code"]) == (False, "OffsetStands")
     assert "-38 um on axis X" in answer["text"]
     assert "start fdhil-guard" in answer["advice"]
@@ -227,14 +227,14 @@ async def test_arming_frozen_guard_advises_adopt(
     config: MachineConfig, guard: GuardPeer, folder: Path, tmp_path: Path
 ) -> None:
     guard.says = lambda _kind: FROZEN
-    desk = ArmingService(config, OutcomeStore(config), folder)
-    desk.start_from_history({}, [])
+    service = ArmingService(config, OutcomeStore(config), folder)
+    service.start_from_history({}, [])
     request = {"request": "arm", "program": str(tmp_path / "a.ngc"), "token": read_token(folder)}
-    answer = await desk.arm(request)
+    answer = await service.arm(request)
     assert (answer["ok"], answer["code"]) == (False, "OffsetStands")
     assert STANDS in answer["text"]
     assert answer["advice"] == "hold the feed, then run fdhil adopt, then arm again"
-    desk.guard.close()
+    service.guard.close()
 
 
 def run_daemon(machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, meanwhile: Any) -> tuple[int, str]:
@@ -243,10 +243,10 @@ def run_daemon(machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, mean
     path = machine.parent / "fdhil-data" / "run" / "daemon.sock"
 
     def stop() -> None:
-        told: dict[str, Any] = {}
-        while not told:
+        reported: dict[str, Any] = {}
+        while not reported:
             try:
-                told = ask_daemon(path, {"request": "status"})
+                reported = ask_daemon(path, {"request": "status"})
             except ConnectError:
                 threading.Event().wait(0.02)
         meanwhile(path)
@@ -260,9 +260,9 @@ def run_daemon(machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, mean
 
 
 def wait_for_status(path: Path, ready: Any) -> dict[str, Any]:
-    while not ready(told := ask_daemon(path, {"request": "status"})):
+    while not ready(reported := ask_daemon(path, {"request": "status"})):
         threading.Event().wait(0.02)
-    return told
+    return reported
 
 
 def test_run_exits_zero_only_if_guard_reports_zero(
@@ -285,13 +285,13 @@ def test_run_without_guard_exits_nonzero_with_residual_offset(
 ) -> None:
     store = machine_config.load_config(machine).store.directory
     ResidualOffsetFile(store).store(residual_offset.read_residual_offset(FROZEN))
-    told: dict[str, Any] = {}
+    reported: dict[str, Any] = {}
     code, err = run_daemon(
-        machine, monkeypatch, capsys, lambda p: told.update(wait_for_status(p, lambda s: s["notices"]))
+        machine, monkeypatch, capsys, lambda p: reported.update(wait_for_status(p, lambda s: s["notices"]))
     )
     assert code == 3
-    assert (told["state"], told["may_stand"]) == ("lost", {"nothing": False, "text": STANDS})
-    assert [(n["code"], n["severity"]) for n in told["notices"]] == [("GuardLost", "MAJOR")]
+    assert (reported["state"], reported["may_stand"]) == ("lost", {"nothing": False, "text": STANDS})
+    assert [(n["code"], n["severity"]) for n in reported["notices"]] == [("GuardLost", "MAJOR")]
     assert err.splitlines()[-1].endswith(f"stopped, {STANDS}; hold the feed, start fdhil-guard, then run fdhil adopt")
 
 
@@ -299,21 +299,21 @@ def test_run_after_guard_death_reports_residual_offset(
     machine: Path, guard: GuardPeer, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     guard.says = lambda _kind: ACTIVE
-    told: dict[str, Any] = {}
+    reported: dict[str, Any] = {}
 
     def dies(path: Path) -> None:
         wait_for_status(path, lambda s: s["state"] == "ACTIVE")
         guard.close()
-        told.update(wait_for_status(path, lambda s: s["state"] == "lost"))
-        told["disarm"] = fdhil("disarm", machine, capsys=capsys)
+        reported.update(wait_for_status(path, lambda s: s["state"] == "lost"))
+        reported["disarm"] = fdhil("disarm", machine, capsys=capsys)
 
     code, err = run_daemon(machine, monkeypatch, capsys, dies)
     stands = "-38 um on axis X and an unknown offset on axis Y may still be applied"
     assert code == 3
-    assert told["may_stand"] == {"nothing": False, "text": stands}
-    assert "nothing is sent" not in json.dumps(told["guard"])
-    assert told["disarm"][0] == 1
-    assert stands in told["disarm"][2]
+    assert reported["may_stand"] == {"nothing": False, "text": stands}
+    assert "nothing is sent" not in json.dumps(reported["guard"])
+    assert reported["disarm"][0] == 1
+    assert stands in reported["disarm"][2]
     assert stands in err.splitlines()[-1]
 
 
@@ -322,8 +322,8 @@ def test_adopt_shows_offset_confirms_and_reaches_zero(
 ) -> None:
     now = [FROZEN, {**FROZEN, "state": "ADOPT"}, {**FROZEN, "state": "ADOPT"}, OFF]
     guard.says = lambda kind: {"ok": True} if kind == "adopt" else now.pop(0) if len(now) > 1 else now[0]
-    for said in ("n\n", ""):  # no, and nobody who could say it
-        monkeypatch.setattr("sys.stdin", io.StringIO(said))
+    for message in ("n\n", ""):  # no, and nobody who could say it
+        monkeypatch.setattr("sys.stdin", io.StringIO(message))
         code, _, err = fdhil("adopt", machine, capsys=capsys)
         assert (code, guard.heard) == (3, ["status"])
         assert f"the guard is FROZEN: {STANDS}" in err

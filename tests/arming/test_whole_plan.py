@@ -66,11 +66,11 @@ def test_program_beyond_32_bits_is_refused_by_both_checks(tmp_path: Path) -> Non
     config = parse_config(document, folder=tmp_path)
     program = tmp_path / "far.ngc"
     program.write_text(FAR.format(2147.2337))
-    told = "line 1, 'X': axis X at 2147.2337 mm: .* is 2147.2336 mm"
+    reported = "line 1, 'X': axis X at 2147.2337 mm: .* is 2147.2336 mm"
     for method in (None, "mirror"):
-        with pytest.raises(ProgramError, match=told):
+        with pytest.raises(ProgramError, match=reported):
             make_whole_plan(program, config, method)
-    with pytest.raises(ProgramError, match=told):
+    with pytest.raises(ProgramError, match=reported):
         check_program(
             program, compute_program_digest(program), build_nominal_models(config), config, io.BytesIO(), print
         )

@@ -24,9 +24,9 @@ def cycle(number: int, place: float, kind: int, line: int = 1, held: bool = Fals
 def select_states(
     cycles: Sequence[Cycle], status: Status = STATUS, axes: str = "XYZ", mm: float = 1.0
 ) -> list[dict[str, Any]]:
-    teller = StatePublisher(list(axes), mm, MS)
-    teller.update_clock(cycles[0].number, 1000 * MS)
-    return [state for each in cycles for state in teller.select_states(each, status)]
+    publisher = StatePublisher(list(axes), mm, MS)
+    publisher.update_clock(cycles[0].number, 1000 * MS)
+    return [state for each in cycles for state in publisher.select_states(each, status)]
 
 
 def test_each_change_is_published_with_its_previous_cycle() -> None:
@@ -59,10 +59,10 @@ def test_inches_are_converted_and_the_first_joint_of_an_axis_is_published() -> N
 
 
 def test_late_cycle_gets_an_unbiased_stamp() -> None:
-    teller = StatePublisher(["X"], 1.0, MS)
-    teller.update_clock(100, 1000 * MS)
-    teller.update_clock(110, 1060 * MS)  # 50 ms late
-    (state,) = teller.select_states(cycle(110, 0.0, 0), STATUS)
+    publisher = StatePublisher(["X"], 1.0, MS)
+    publisher.update_clock(100, 1000 * MS)
+    publisher.update_clock(110, 1060 * MS)  # 50 ms late
+    (state,) = publisher.select_states(cycle(110, 0.0, 0), STATUS)
     assert abs(state["stamp_ns"] - 1010 * MS) < MS
 
 

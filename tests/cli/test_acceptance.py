@@ -50,8 +50,8 @@ def test_commissioned_machine_is_accepted(proven: MachineConfig, tmp_path: Path,
     code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)
     document = json.loads(out)
     assert (code, document["accepted"], document["open"]) == (0, True, [])
-    told = {key: value for key, value in document.items() if key != "sha256"}
-    text = json.dumps(told, sort_keys=True, separators=(",", ":"))
+    reported = {key: value for key, value in document.items() if key != "sha256"}
+    text = json.dumps(reported, sort_keys=True, separators=(",", ":"))
     assert hashlib.sha256(text.encode()).hexdigest() == document["sha256"]
     shown = html.unescape(page.read_text("utf-8"))
     assert document["sha256"] in shown

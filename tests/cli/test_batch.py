@@ -87,14 +87,16 @@ def test_folder_is_expanded_and_stored_window_keeps_its_bits(
     files = {Path(file["file"]).stem: file for file in json.loads(out)["files"]}
     assert (code, sorted(files)) == (0, sorted(window.name for window in windows))
     for again in reanalyse_batch(windows, stored_rapids.create_method(folder)):
-        (told,) = files[again.window.name]["windows"]
+        (reported,) = files[again.window.name]["windows"]
         fleet = json.loads(again.text)
         window = read_window(window_files.build_window_path(folder, again.window.name))
-        assert told["start_s"] == round(window.start_s + find_moving_range(window)[0] * window.dt_s, 6)  # original time
-        assert told["validated"] == fleet["accepted"]
-        assert told["fit_percent"] == fleet["fit_percent"]
+        assert reported["start_s"] == round(
+            window.start_s + find_moving_range(window)[0] * window.dt_s, 6
+        )  # original time
+        assert reported["validated"] == fleet["accepted"]
+        assert reported["fit_percent"] == fleet["fit_percent"]
         for name, found in fleet["parameters"].items():
-            assert (told["parameters"][name]["value"], told["parameters"][name]["std"]) == (
+            assert (reported["parameters"][name]["value"], reported["parameters"][name]["std"]) == (
                 found["value"],
                 found["std"],
             )

@@ -84,9 +84,9 @@ def make_message(can_id: int, data: bytes) -> can.Message:
 def answer_of(bus: can.BusABC, can_id: int) -> bytes:
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
-        heard = bus.recv(1.0)
-        if heard is not None and heard.arbitration_id == can_id:
-            return bytes(heard.data)
+        received = bus.recv(1.0)
+        if received is not None and received.arbitration_id == can_id:
+            return bytes(received.data)
     raise AssertionError(f"no {can_id:03X}")
 
 
@@ -103,8 +103,8 @@ def run_fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(sys, "argv", ["fdhil", *map(str, arguments)])
         monkeypatch.setattr(sys, "stdin", io.StringIO(said))
         code = run_safely(cli)
-        heard = capsys.readouterr()
-        return code, heard.out, heard.err
+        received = capsys.readouterr()
+        return code, received.out, received.err
 
     return run
 
@@ -218,11 +218,11 @@ def test_check_reports_differences_with_advice(
     config = commissioning_bench.write_config("different.toml", old, new)
     checked = parse_document(run_fdhil, "check", config, code=1)
     assert checked["matches"] is False
-    told = list_points(checked, "differs")[f"axis X {point}"]
-    assert told["found"] == found
-    assert told["cause"]
-    assert told["advice"]
-    assert (told["expected"], told["found"]) != ("", told["expected"])
+    reported = list_points(checked, "differs")[f"axis X {point}"]
+    assert reported["found"] == found
+    assert reported["cause"]
+    assert reported["advice"]
+    assert (reported["expected"], reported["found"]) != ("", reported["expected"])
 
 
 @pytest.mark.usefixtures("real_time")
@@ -272,16 +272,16 @@ def test_doubt_during_comparison_keeps_record_void(
     config = load_config(path)
     store = config.store.directory
     config.guard_directory.mkdir(parents=True, exist_ok=True)
-    guard, said = GuardPeer(config.guard_directory), {"ok": True, "state": "OFF", "touched": {"X": 3, "Y": 0}}
+    guard, message = GuardPeer(config.guard_directory), {"ok": True, "state": "OFF", "touched": {"X": 3, "Y": 0}}
     void = {"code": "RecordVoid", "axis": "Y", "text": "axis Y: it has booted", "advice": "run fdhil check"}
 
     def compare(*_: object) -> list[tuple[str, Finding]]:
         mark_record_void(store, "X", "booted again")
-        guard.says = lambda kind: {"ok": False, "refused": [void]} if kind == "compared" else said
+        guard.says = lambda kind: {"ok": False, "refused": [void]} if kind == "compared" else message
         return [(f"axis {axis}", Finding(RECORD_POINT, "f", "f")) for axis in "XY"]
 
     monkeypatch.setattr("fdhil.commissioning.config_check.check_machine", compare)
-    guard.says = lambda _kind: said
+    guard.says = lambda _kind: message
     for axis in "XY":
         mark_record_void(store, axis, "booted")
     code, _, err = run_fdhil("check", path, "--json")
@@ -300,16 +300,16 @@ def test_doubt_during_comparison_keeps_record_void(
 @pytest.mark.usefixtures("real_time")
 def test_axis_does_not_move_without_confirmation(run_fdhil: Said, commissioning_bench: CommissioningBench) -> None:
     config = commissioning_bench.write_config("asked.toml")
-    with record_frames(commissioning_bench) as heard:
-        for said in ("\nn\n", ""):
-            code, out, err = run_fdhil("commission", config, "--axis", "X", said=said)
+    with record_frames(commissioning_bench) as received:
+        for message in ("\nn\n", ""):
+            code, out, err = run_fdhil("commission", config, "--axis", "X", said=message)
             assert code == 1
             assert "step 2 of 7, compare" in out
             assert "step 3" not in out
             assert "the axis will move by 10 um" in err
             assert "nothing was moved or written" in err
-    assert 0x601 in heard
-    assert not {0x000, 0x080, 0x201, 0x301} & set(heard)
+    assert 0x601 in received
+    assert not {0x000, 0x080, 0x201, 0x301} & set(received)
     assert load_record(config.parent / "fdhil-data", "X") is None
 
 
@@ -325,28 +325,28 @@ def test_pdos_are_written_after_confirmation_without_motion(
         packaged.replace("entries = [[0x6041, 0, 16, false], [0x6078, 0, 16, true], [0x2101, 0, 16, true]]", tpdo2)
     )
     other = commissioning_bench.write_config("other.toml", DRIVE, f'[axis.X.drive]\nprofile = "{own}"\n{DRIVE}')
-    with record_frames(commissioning_bench) as heard:
+    with record_frames(commissioning_bench) as received:
         code, _, err = run_fdhil("commission", other, "--axis", "X", "--set-pdos", said="n\n")
         assert (code, "nothing was written" in err) == (1, True)
-        assert 0x601 not in heard
+        assert 0x601 not in received
         done = parse_document(run_fdhil, "commission", other, "--axis", "X", "--set-pdos", "--yes")
         assert done["axes"]["X"]["pdos_written"] == ["TPDO2"]
         code, out, _ = run_fdhil("commission", commissioning_bench.write_config(), "--axis", "X", "--set-pdos", "--yes")
         assert (code, "PDOs written: TPDO2" in out) == (0, True)
-    assert not {0x080, 0x201, 0x301} & set(heard)
+    assert not {0x080, 0x201, 0x301} & set(received)
 
 
 @contextmanager
 def record_frames(bench: CommissioningBench) -> Iterator[list[int]]:
-    heard: list[int] = []
+    received: list[int] = []
 
     def keep(frame: can.Message) -> None:
-        heard.append(frame.arbitration_id)
+        received.append(frame.arbitration_id)
 
     with bench.twin.join_bus() as bus:
         notifier = can.Notifier(bus, [keep], timeout=0.05)
         try:
-            yield heard
+            yield received
         finally:
             notifier.stop()
 
@@ -422,12 +422,12 @@ def collect_controlwords_until_pre_operational(bus: can.BusABC) -> Sequence[int]
     words = []
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
-        heard = bus.recv(1.0)
-        if heard is None:
+        received = bus.recv(1.0)
+        if received is None:
             continue
-        if heard.arbitration_id == 0x201:
-            words.append(int.from_bytes(heard.data[:2], "little"))
-        if heard.arbitration_id == 0 and heard.data[0] == 0x80:
+        if received.arbitration_id == 0x201:
+            words.append(int.from_bytes(received.data[:2], "little"))
+        if received.arbitration_id == 0 and received.data[0] == 0x80:
             return words
     raise AssertionError("drive X was not taken out of Operational")
 
@@ -473,19 +473,19 @@ def running_nc(
 
 def assert_nothing_sent(fdhil: Said, cut: CommissioningBench, *arguments: object, code: int = 0) -> str:
     """Run a command and assert that no SDO was sent meanwhile; return its output."""
-    with record_frames(cut) as heard:
+    with record_frames(cut) as received:
         got, out, err = fdhil(*arguments)
     assert got == code, (out, err)
-    assert 0x80 in heard
-    assert not {i for i in heard if 0x580 <= i < 0x700}
+    assert 0x80 in received
+    assert not {i for i in received if 0x580 <= i < 0x700}
     return out + err
 
 
 @pytest.mark.usefixtures("real_time")
 def test_scan_only_listens_while_nc_runs(run_fdhil: Said, running_nc: CommissioningBench) -> None:
-    said = assert_nothing_sent(run_fdhil, running_nc, "scan", running_nc.write_config())
-    assert "an NC runs it (SYNC received), so no node was queried" in said
-    assert "operational" in said
+    message = assert_nothing_sent(run_fdhil, running_nc, "scan", running_nc.write_config())
+    assert "an NC runs it (SYNC received), so no node was queried" in message
+    assert "operational" in message
 
 
 @pytest.mark.usefixtures("real_time")
@@ -503,10 +503,10 @@ def test_check_compares_received_data_while_nc_runs(run_fdhil: Said, running_nc:
 @pytest.mark.usefixtures("real_time")
 def test_check_reports_different_sync_period(run_fdhil: Said, running_nc: CommissioningBench) -> None:
     config = running_nc.write_config("period.toml", "sync_period_s = 0.001", "sync_period_s = 0.0005")
-    said = assert_nothing_sent(run_fdhil, running_nc, "check", config, code=1)
-    assert "but the configuration has 0.5 ms; correct machine.sync_period_s or the NC's cycle" in said
+    message = assert_nothing_sent(run_fdhil, running_nc, "check", config, code=1)
+    assert "but the configuration has 0.5 ms; correct machine.sync_period_s or the NC's cycle" in message
 
 
 def test_commissioning_is_refused_while_nc_runs(run_fdhil: Said, running_nc: CommissioningBench) -> None:
-    said = assert_nothing_sent(run_fdhil, running_nc, "commission", running_nc.write_config(), "--yes", code=3)
-    assert "an NC is sending SYNC or set-points; switch it off" in said
+    message = assert_nothing_sent(run_fdhil, running_nc, "commission", running_nc.write_config(), "--yes", code=3)
+    assert "an NC is sending SYNC or set-points; switch it off" in message

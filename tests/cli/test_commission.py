@@ -59,8 +59,8 @@ class DriveBench:
         sys.stdin = said if isinstance(said, io.StringIO) else io.StringIO(said)
         sys.argv[1:] = ["commission", str(self.file), *arguments]
         code = run_safely(cli)
-        heard = self.capsys.readouterr()
-        return code, heard.out, heard.err
+        received = self.capsys.readouterr()
+        return code, received.out, received.err
 
     def type_answers(self, old: str, new: str) -> None:
         text = self.file.read_text()
@@ -143,10 +143,10 @@ def test_interrupted_commissioning_continues_with_unfinished_step(
     assert first is not None
     assert first.watchdog == "proven"
 
-    heard = len(drive_bench.peer.heard)
+    received = len(drive_bench.peer.heard)
     code, out, _ = drive_bench.run_commission("--yes")
     assert (code, "step 3" in out, "watchdog test: skipped" in out) == (0, False, True)
-    assert not {0x000, 0x080, 0x201, 0x301} & set(drive_bench.peer.heard[heard:])
+    assert not {0x000, 0x080, 0x201, 0x301} & set(drive_bench.peer.heard[received:])
     again = load_record(drive_bench.store, "X")
     assert again is not None
     assert again.sign_test_um == first.sign_test_um
@@ -188,14 +188,14 @@ def test_confirmed_trial_identifies_axis_and_stores_history(
     assert beats > 4  # the drive stops by itself after this process ends
     assert [drive_bench.peer.drive.dictionary.get_number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
-    heard = len(drive_bench.peer.heard)
+    received = len(drive_bench.peer.heard)
     code, out, _ = drive_bench.run_commission("--yes", "--json", "--room", "-2", "130")
     tried = json.loads(out)["axes"]["X"]["trial"]
     assert (code, tried.keys()) == (0, {"jog", "test rapids", "identification", "acceptance"})
     assert (tried["jog"]["seen"], tried["test rapids"]["moves"]) == ("yes", 4)
     assert abs(tried["test rapids"]["voltage_late_ms"]) < 0.1
     assert all(move["left_rms_um"] < 0.1 * move["measured_rms_um"] for move in tried["acceptance"]["moves"])
-    assert not {0x000, 0x080, 0x201, 0x301} & set(drive_bench.peer.heard[heard:])
+    assert not {0x000, 0x080, 0x201, 0x301} & set(drive_bench.peer.heard[received:])
     assert drive_bench.peer.drive.table_mm == pytest.approx(0.0, abs=0.05)
 
 

@@ -20,9 +20,9 @@ def test_cold_cache_is_announced_once_with_duration(
     for _ in range(2):
         compilation_notice.announce_compilation("predict", "correct")
     compilation_notice.announce_compilation.cache_clear()
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err == "compiling the numerics, once, about 15 s\n"
+    message = capsys.readouterr()
+    assert message.out == ""
+    assert message.err == "compiling the numerics, once, about 15 s\n"
 
 
 def test_cached_kernels_of_numba_are_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

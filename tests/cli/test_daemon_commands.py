@@ -66,8 +66,8 @@ def serve_answers(machine: Path, answer: Mapping[str, Any], *told: Mapping[str, 
 
 def make_status(tmp_path: Path) -> dict[str, Any]:
     watch = DaemonStatus(config_of(tmp_path, ("X", "Y")), 0.0)
-    for told in (make_outcome(), make_published(), Notice("LoadChanged", "MAJOR", "[red]Jt rose[/red]", "X")):
-        watch.take_outcome(told, 1.0)
+    for reported in (make_outcome(), make_published(), Notice("LoadChanged", "MAJOR", "[red]Jt rose[/red]", "X")):
+        watch.take_outcome(reported, 1.0)
     store = {"directory": "d", "fault": "DiskFull", "strays": []}
     return {"ok": True, "state": "OFF(SHADOW)", **watch.build_status(2.0), "counters": {"frames": 7}, "store": store}
 
@@ -76,8 +76,8 @@ def test_status_is_printed_as_table_and_json(machine: Path, tmp_path: Path, caps
     with serve_answers(machine, make_status(tmp_path)) as requests:
         code, out, err = fdhil("status", machine, capsys=capsys)
     assert (code, err, requests) == (0, "", [{"request": "status"}])
-    heard = ("bench", "no SYNC yet", "frames received 7, lost 0")
-    for words in (*heard, "1/0", "DiskFull", "[red]Jt rose[/red]", "OFF"):
+    received = ("bench", "no SYNC yet", "frames received 7, lost 0")
+    for words in (*received, "1/0", "DiskFull", "[red]Jt rose[/red]", "OFF"):
         assert words in out, (words, out)
     (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
     with serve_answers(machine, make_status(tmp_path)):
@@ -183,18 +183,18 @@ def test_undelivered_refusal_exits_3(how: str, machine: Path) -> None:
 
 
 def test_arm_shows_progress_of_program_check(machine: Path, capsys: Any) -> None:
-    told = {"program": "p.ngc", "checked_s": 83.0, "line": 40, "times_real_time": 31.6, "refused": 2}
+    reported = {"program": "p.ngc", "checked_s": 83.0, "line": 40, "times_real_time": 31.6, "refused": 2}
     refused = {"ok": False, "code": "A", "text": "one", "advice": "do", "refused": ["A: one", "B: two"]}
-    with serve_answers(machine, refused, told | {"refused": 0}, told):
+    with serve_answers(machine, refused, reported | {"refused": 0}, reported):
         code, out, err = fdhil("arm", machine, machine.parent / "p.ngc", capsys=capsys)
     assert (code, out) == (1, "")
     assert "\rchecked 1:23 of the program, line 40, 32 x real time, 2 positions refused" in err
     assert err.splitlines()[-2:] == ["refused: A: one; do", "also: B: two"]
     (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
-    with serve_answers(machine, refused, told):
+    with serve_answers(machine, refused, reported):
         code, out, err = fdhil("arm", machine, machine.parent / "p.ngc", "--json", capsys=capsys)
     assert (code, json.loads(out)) == (1, refused)
-    assert json.loads(err) == {"progress": told}
+    assert json.loads(err) == {"progress": reported}
 
 
 @pytest.mark.parametrize("command", ["status", "disarm"])
@@ -263,18 +263,18 @@ def test_daemon_log_lines_are_json(capsys: pytest.CaptureFixture[str]) -> None:
         service_log.write_line("X: LoadChanged", "MAJOR")
     with service_log.write_lines_as_json(False):
         service_log.write_line("X: said to a person")
-    said = capsys.readouterr()
-    line = json.loads(said.out)
+    message = capsys.readouterr()
+    line = json.loads(message.out)
     assert datetime.fromisoformat(line.pop("time")).tzinfo is not None
     assert line == {"severity": "MAJOR", "text": "X: LoadChanged"}
-    assert "said to a person" in said.err
+    assert "said to a person" in message.err
 
 
 def test_status_shows_terms_and_warnings() -> None:
     load = {"value": 2.5, "std": 0.01, "low": 2.48, "high": 2.52, "unit": "N.m"}
     axis = {"terms": {"load": load}, "unexplained_um": 0.25, "warnings": ["OneDirection: all moves go one way"]}
-    told = "load 2.50 ±0.02 N.m; 0.25 um of the rapids unexplained; OneDirection: all moves go one way"
-    assert describe_model(axis) == told
+    reported = "load 2.50 ±0.02 N.m; 0.25 um of the rapids unexplained; OneDirection: all moves go one way"
+    assert describe_model(axis) == reported
     assert describe_model({"terms": None, "unexplained_um": None, "warnings": []}) == ""
 
 
@@ -314,8 +314,12 @@ def test_status_shows_pending_and_acknowledged_notices(machine: Path, tmp_path: 
         "count": 8,
     }
     alarms = {"active": 1, "unacknowledged": 0, "first": [{**alarm, **since}]}
-    told = status | {"unacknowledged": {"count": 3, "MAJOR": 1, "newest": []}, "notices": [notice], "alarms": alarms}
-    with serve_answers(machine, told):
+    reported = status | {
+        "unacknowledged": {"count": 3, "MAJOR": 1, "newest": []},
+        "notices": [notice],
+        "alarms": alarms,
+    }
+    with serve_answers(machine, reported):
         out = fdhil("status", machine, capsys=capsys)[1]
     assert "X: HeartbeatLost active since 2026-11-22T14:00:00+00:00, 8 times since" in " ".join(out.split())
     assert "pending notices: 3, of them MAJOR 1" in out

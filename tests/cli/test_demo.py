@@ -69,24 +69,24 @@ def test_refusal_is_reported_with_reasons(tmp_path: Path) -> None:
     assert ["load_nm", "", "2.5"] in realistic_page.list_effect_rows(refused)
     write_page(Page("title", "subtitle", [realistic_page.build_headline(refused)], [section]), tmp_path / "report.html")
     assert "0 of 4" in (tmp_path / "report.html").read_text("utf-8")
-    told = _describe_realistic(refused)
-    assert told["axes"]["X"]["parameters"] is None
-    assert told["refused"]
+    reported = _describe_realistic(refused)
+    assert reported["axes"]["X"]["parameters"] is None
+    assert reported["refused"]
 
 
 def test_report_shows_identified_next_to_true_parameters() -> None:
     verdict = AxisOutcome(make_published_set(), 4, 4, {})
-    believed = RealisticResult(
+    accepted = RealisticResult(
         load_machine(), {"X": TRUE}, {"X": verdict}, None, make_passes("uncorrected", "inverse"), ""
     )
-    assert realistic_page.build_headline(believed) == ("on a realistic machine reduced by", "4.0 x")
-    rows = realistic_page.list_parameter_rows(believed)
+    assert realistic_page.build_headline(accepted) == ("on a realistic machine reduced by", "4.0 x")
+    rows = realistic_page.list_parameter_rows(accepted)
     assert [row[1] for row in rows] == [*PARAMETERS, "load"]
     assert rows[-1][3] == "2.500 ±0.002 N.m"
-    assert realistic_page.list_verdict_rows(believed)[0] == ["X", "4 of 4", "six parameters and load", ""]
-    told = _describe_realistic(believed)
-    assert told["axes"]["X"]["terms"] == {"load": 2.5}
-    assert [cut["label"] for cut in told["cuts"]] == ["uncorrected", "inverse"]
+    assert realistic_page.list_verdict_rows(accepted)[0] == ["X", "4 of 4", "six parameters and load", ""]
+    reported = _describe_realistic(accepted)
+    assert reported["axes"]["X"]["terms"] == {"load": 2.5}
+    assert [cut["label"] for cut in reported["cuts"]] == ["uncorrected", "inverse"]
 
 
 def ignore_progress(text: str) -> None:
@@ -98,9 +98,9 @@ def test_realistic_result_is_returned_from_its_process(tmp_path: Path, monkeypat
     found = RealisticResult(load_machine(), {"X": TRUE}, {}, None, make_passes("uncorrected"), "refused")
     monkeypatch.setattr(realistic_machine, "run_realistic", lambda *_: found)
     with run_realistic_in_process(tmp_path, False, ignore_progress) as result:
-        told = result()
-    assert (told.config, told.truth, told.refused) == (found.config, found.truth, found.refused)
-    np.testing.assert_array_equal(told.cuts[0].contour_um, found.cuts[0].contour_um)
+        reported = result()
+    assert (reported.config, reported.truth, reported.refused) == (found.config, found.truth, found.refused)
+    np.testing.assert_array_equal(reported.cuts[0].contour_um, found.cuts[0].contour_um)
 
 
 def time_out(*_: object) -> RealisticResult:

@@ -135,13 +135,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run_with_error(capsys: Any, code: int, *arguments: str) -> str:
-    said = fdhil(*arguments, capsys=capsys)
-    assert said[0] == code, said
-    assert said[1] == ""
-    first, *rest = said[2].splitlines()
-    assert first.startswith("fdhil: "), said[2]
-    assert all(line.startswith("  ") for line in rest), said[2]  # faults of a configuration, one per line
-    assert "Traceback" not in said[2]
+    message = fdhil(*arguments, capsys=capsys)
+    assert message[0] == code, message
+    assert message[1] == ""
+    first, *rest = message[2].splitlines()
+    assert first.startswith("fdhil: "), message[2]
+    assert all(line.startswith("  ") for line in rest), message[2]  # faults of a configuration, one per line
+    assert "Traceback" not in message[2]
     code_of_json, out, err = fdhil(*arguments, "--json", capsys=capsys)
     assert (code_of_json, err) == (code, "")
     document = json.loads(out)
@@ -153,7 +153,7 @@ def run_with_error(capsys: Any, code: int, *arguments: str) -> str:
         error = document["error"]
     assert error["class"].isidentifier()
     assert len(error["text"]) > 20
-    return str(said[2])
+    return str(message[2])
 
 
 def test_tables_of_this_module_list_every_command() -> None:
@@ -226,9 +226,9 @@ def test_file_without_permission_exits_3_and_config_exits_2() -> None:
     as_json = ["arm", "bench.toml", "locked.ngc", "--json"]
     given = json.dumps([as_json, *calls, *configs])
     done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=300)
-    *told, codes = done.stderr.splitlines()
-    assert json.loads(codes) == [TROUBLE] * len([as_json, *calls]) + [USAGE] * len(configs), told
-    assert len(told) == len(calls) + len(configs)
+    *reported, codes = done.stderr.splitlines()
+    assert json.loads(codes) == [TROUBLE] * len([as_json, *calls]) + [USAGE] * len(configs), reported
+    assert len(reported) == len(calls) + len(configs)
     assert "locked.ngc: Permission denied" in json.loads(done.stdout)["error"]["text"]
 
 
@@ -281,15 +281,15 @@ def test_missing_bus_exits_3(command: str, capsys: Any) -> None:
 
 @pytest.mark.parametrize("command", ["status", "arm", "disarm"])
 def test_missing_daemon_exits_3(command: str, capsys: Any) -> None:
-    said = run_with_error(
+    message = run_with_error(
         capsys, TROUBLE, command, *(text.format(config="bench.toml") for text in WITH_CONFIG[command])
     )
-    assert "fdhil run" in said
+    assert "fdhil run" in message
 
 
 def test_missing_history_exits_3(capsys: Any) -> None:
     for command in ("history", "report"):
-        said = run_with_error(
+        message = run_with_error(
             capsys, TROUBLE, command, *(text.format(config="bench.toml") for text in WITH_CONFIG[command])
         )
-        assert "history" in said
+        assert "history" in message

@@ -78,9 +78,9 @@ def test_missing_hub_is_reported_in_one_sentence(
 ) -> None:
     with reserve_port() as port:
         assert run_guard(monkeypatch, str(write_config(tmp_path, port))) == 3
-    told = capsys.readouterr().err
-    assert "start the hub first" in told
-    assert len(told.splitlines()) == 1
+    reported = capsys.readouterr().err
+    assert "start the hub first" in reported
+    assert len(reported.splitlines()) == 1
 
 
 def test_commissioning_is_refused_while_guard_owns_bus(
@@ -116,9 +116,9 @@ def test_guard_process_owns_bus_and_stops_cleanly(
             seconds = [(run_guard(monkeypatch, str(again)), capsys.readouterr().err) for again in (config, other)]
         finally:
             process.send_signal(signal.SIGTERM)
-        told = [json.loads(line) for line in process.stdout]
+        reported = [json.loads(line) for line in process.stdout]
         assert process.wait(300) == 0
-        assert told[-1]["event"] == "stopped"
+        assert reported[-1]["event"] == "stopped"
     assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
     assert [code for code, _ in seconds] == [3, 3]
     assert all("BusLocked" in refused and len(refused.splitlines()) == 1 for _, refused in seconds)
@@ -139,9 +139,9 @@ def test_guard_with_closed_stdout_sends_nothing_on_bus(closed: str, tmp_path: Pa
             time.sleep(0.05)
         held = {number: str(Path(f"/proc/{process.pid}/fd/{number}").readlink()) for number in range(3)}
         process.send_signal(signal.SIGTERM)
-        _, told = process.communicate()
+        _, reported = process.communicate()
     assert not any(where.startswith("socket:") for where in held.values()), held
-    assert told == b""
+    assert reported == b""
     assert peer.sent == []
 
 

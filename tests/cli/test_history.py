@@ -74,8 +74,8 @@ def test_load_change_is_detected_and_named(worn_history: Path, capsys: Any) -> N
     (change,) = document["changes"]["X"]
     assert _count_days(change["time"]) == pytest.approx(STEP_DAY, abs=0.6)
     assert change["cause"] == "a changed load"
-    told = change["parameters"]["Jt"]
-    assert (told["before"], told["after"]) == (pytest.approx(0.075, rel=2e-3), pytest.approx(0.08475, rel=2e-3))
+    reported = change["parameters"]["Jt"]
+    assert (reported["before"], reported["after"]) == (pytest.approx(0.075, rel=2e-3), pytest.approx(0.08475, rel=2e-3))
     # the trend of Jt restarts at the step, which is not wear
     assert _count_days(document["trends"]["X"]["Jt"]["since"]) == pytest.approx(STEP_DAY, abs=0.6)
     assert document["trends"]["X"]["Jt"]["low"] <= 0 <= document["trends"]["X"]["Jt"]["high"]
@@ -121,9 +121,9 @@ def test_report_starts_with_condition_of_drives(worn_history: Path, tmp_path: Pa
     assert "g·m²" in cells[0]
     assert [p for p in PARAMETERS if f"<figcaption>{p}, " not in axis] == []
     (inertia,) = re.findall(r"<figure>((?:(?!<figure>).)*)<figcaption>Jt, ", axis, re.S)
-    told = json.loads(html.unescape(re.findall(r"<metadata>(.*?)</metadata>", inertia, re.S)[0]))
-    assert told["panels"][0]["levels"] == [["nominal", 75]]
-    assert [label for label, _ in told["marks"]] == ["a changed load"]
+    reported = json.loads(html.unescape(re.findall(r"<metadata>(.*?)</metadata>", inertia, re.S)[0]))
+    assert reported["panels"][0]["levels"] == [["nominal", 75]]
+    assert [label for label, _ in reported["marks"]] == ["a changed load"]
 
 
 def test_refused_rapids_are_in_report(tmp_path: Path, capsys: Any) -> None:
@@ -158,8 +158,8 @@ def test_long_history_gives_small_page(tmp_path: Path, capsys: Any) -> None:
     assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
     assert len(page) < 600_000
-    told = json.loads(html.unescape(re.findall(r"<metadata>(.*?)</metadata>", page, re.S)[0]))
-    (median, *_) = told["panels"][0]["traces"]
+    reported = json.loads(html.unescape(re.findall(r"<metadata>(.*?)</metadata>", page, re.S)[0]))
+    (median, *_) = reported["panels"][0]["traces"]
     assert median["label"].startswith("median of the day")
     assert len(median["y"]) == 21
     assert all(
@@ -169,9 +169,9 @@ def test_long_history_gives_small_page(tmp_path: Path, capsys: Any) -> None:
 
 def test_unknown_axis_is_refused(worn_history: Path, capsys: Any) -> None:
     """An unknown axis is a wrong option, not an empty history."""
-    code, _, told = fdhil("history", worn_history, "--axis", "Q", capsys=capsys)
+    code, _, reported = fdhil("history", worn_history, "--axis", "Q", capsys=capsys)
     assert code == 2
-    assert "has no axis Q" in told
+    assert "has no axis Q" in reported
 
 
 def test_tables_fit_80_columns_and_explain_intervals(worn_history: Path, capsys: Any) -> None:
@@ -180,12 +180,12 @@ def test_tables_fit_80_columns_and_explain_intervals(worn_history: Path, capsys:
     assert "…" not in out
     assert out.count("half the width of the 95 % interval") == 2
     document = json.loads(fdhil("history", worn_history, "--json", capsys=capsys)[1])
-    told = document["revisions"][-1]["parameters"]["Jt"]
+    reported = document["revisions"][-1]["parameters"]["Jt"]
     (newest,) = (line for line in out.splitlines() if line.startswith("120 "))
-    assert f"{1e3 * told['value']:.0f}" in newest.split()
-    half = (told["high"] - told["low"]) / 2
+    assert f"{1e3 * reported['value']:.0f}" in newest.split()
+    half = (reported["high"] - reported["low"]) / 2
     assert f"±{1e3 * half:.0f}" in out.splitlines()[out.splitlines().index(newest) + 1].split()
-    assert half == pytest.approx(1.96 * told["std"], rel=1e-3)
+    assert half == pytest.approx(1.96 * reported["std"], rel=1e-3)
 
 
 def test_history_and_report_show_pending_and_acknowledged_notices(tmp_path: Path, capsys: Any) -> None:
@@ -200,8 +200,8 @@ def test_history_and_report_show_pending_and_acknowledged_notices(tmp_path: Path
     assert "pending notices (see fdhil acknowledge): 1" in out
     assert "acknowledged by anna" in out
     assert "the bus is back" not in out
-    told = json.loads(fdhil("history", path, "--json", capsys=capsys)[1])["notices"]
-    assert [notice["acknowledged"] and notice["acknowledged"]["who"] for notice in told] == ["anna", None]
+    reported = json.loads(fdhil("history", path, "--json", capsys=capsys)[1])["notices"]
+    assert [notice["acknowledged"] and notice["acknowledged"]["who"] for notice in reported] == ["anna", None]
     assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text("utf-8")
     assert "the bus was gone again" in page

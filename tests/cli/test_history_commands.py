@@ -56,10 +56,15 @@ def test_replay_prints_outcomes_in_full_precision(rapid: Path, capsys: Any) -> N
     code, out, _ = fdhil("replay", "--json", rapid, capsys=capsys)
     document = json.loads(out)
     assert (code, document["schema"], document["validated"]) == (0, "fdhil-replay-1", True)
-    told, parameters = document["files"][0]["outcomes"]
-    assert (told["kind"], told["axis"], told["direction"], told["validated"]) == ("window", "X", 1, True)
-    assert told["parameters"]["Jt"]["unit"] == "kg.m2"
-    assert parameters["parameters"]["Jt"]["value"] == told["parameters"]["Jt"]["value"]
+    reported, parameters = document["files"][0]["outcomes"]
+    assert (reported["kind"], reported["axis"], reported["direction"], reported["validated"]) == (
+        "window",
+        "X",
+        1,
+        True,
+    )
+    assert reported["parameters"]["Jt"]["unit"] == "kg.m2"
+    assert parameters["parameters"]["Jt"]["value"] == reported["parameters"]["Jt"]["value"]
     assert fdhil("replay", "--json", rapid, capsys=capsys)[1] == out
     code, out, _ = fdhil("replay", rapid, "--method", "least_squares", capsys=capsys)
     assert code == 0
@@ -93,9 +98,9 @@ def test_export_keeps_low_rate_samples_bit_exact(tmp_path: Path, capsys: Any) ->
     made = record_slow_windows(0.005, delay_s=0.0012)[0]
     before = made.slow_voltage
     assert before is not None
-    told = np.array(before.voltage_v)
-    told[70] = np.nan
-    made = replace(made, slow_voltage=replace(before, voltage_v=freeze_array(told)))
+    reported = np.array(before.voltage_v)
+    reported[70] = np.nan
+    made = replace(made, slow_voltage=replace(before, voltage_v=freeze_array(reported)))
     stored.write_bytes(encode_window(made, ""))
     assert fdhil("export", stored, "--out", out, capsys=capsys) == (0, "", f"wrote {out}\n")
     (window,) = read_windows(out)
@@ -103,7 +108,7 @@ def test_export_keeps_low_rate_samples_bit_exact(tmp_path: Path, capsys: Any) ->
     slow = window.slow_voltage
     assert slow is not None
     assert (slow.begin_s, slow.period_s, slow.error_s) == (before.begin_s, 0.005, 0.0002)
-    assert np.array_equal(slow.voltage_v, told, equal_nan=True)
+    assert np.array_equal(slow.voltage_v, reported, equal_nan=True)
     documents = [json.loads(fdhil("replay", "--json", path, capsys=capsys)[1]) for path in (stored, out)]
     one, other = (document["files"][0]["outcomes"][0] for document in documents)
     assert other["parameters"]["L"]["value"] == pytest.approx(one["parameters"]["L"]["value"], rel=1e-3)
@@ -144,8 +149,8 @@ def test_history_json_has_intervals_and_full_precision(machine: Path, capsys: An
     document = json.loads(out)
     assert (code, document["schema"]) == (0, "fdhil-history-1")
     assert [(row["axis"], row["revision"]) for row in document["revisions"]] == [("X", 1), ("X", 2), ("Y", 1)]
-    told = document["revisions"][0]["parameters"]["R"]
-    assert told["value"] == make_published(1).parameters.R
+    reported = document["revisions"][0]["parameters"]["R"]
+    assert reported["value"] == make_published(1).parameters.R
     assert document["revisions"][1]["window_ids"] == [1, 3]
     code, out, _ = fdhil("history", machine, "--json", "--axis", "Y", capsys=capsys)
     assert [row["axis"] for row in json.loads(out)["revisions"]] == ["Y"]
@@ -177,10 +182,10 @@ def test_history_shows_temperature_slopes(tmp_path: Path, capsys: Any) -> None:
         )
     store.close()
     _, out, _ = fdhil("history", path, "--json", capsys=capsys)
-    told = json.loads(out)["slopes"]["X"]
-    assert told["ft"]["per_kelvin"] == pytest.approx(-0.005)
-    assert told["ft"]["high"] < 0.0
-    assert told["Jt"]["low"] <= 0.0 <= told["Jt"]["high"]
+    reported = json.loads(out)["slopes"]["X"]
+    assert reported["ft"]["per_kelvin"] == pytest.approx(-0.005)
+    assert reported["ft"]["high"] < 0.0
+    assert reported["Jt"]["low"] <= 0.0 <= reported["Jt"]["high"]
     assert "per kelvin of" in fdhil("history", path, capsys=capsys)[1]
 
 

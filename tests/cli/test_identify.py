@@ -45,10 +45,10 @@ def test_json_has_every_window_and_the_pool(shuttle: Path) -> None:
     assert result.return_value == 0
     document = load_json_document(result)
     assert document["schema"] == "fdhil-identify-1"
-    (told,) = document["files"]
-    assert (told["file"], told["axis"]) == (str(shuttle), "X")
-    assert [w["direction"] for w in told["windows"]] == [1, -1]
-    for window in told["windows"]:
+    (reported,) = document["files"]
+    assert (reported["file"], reported["axis"]) == (str(shuttle), "X")
+    assert [w["direction"] for w in reported["windows"]] == [1, -1]
+    for window in reported["windows"]:
         assert window["validated"] is True
         assert window["reasons"] == []
         assert 98 < window["fit_percent"] < 100
@@ -56,7 +56,7 @@ def test_json_has_every_window_and_the_pool(shuttle: Path) -> None:
             "start_s", "end_s", "direction", "parameters", "terms", "validated", "fit_percent", "unexplained_um",
             "reasons", "warnings",
         }  # fmt: skip
-    pooled = told["pooled"]
+    pooled = reported["pooled"]
     assert pooled["windows_used"] == 2
     assert pooled["validated"] is True
     truth = bench.Plant().truth()
@@ -107,12 +107,12 @@ def test_refused_recording_exits_1_with_null_values(tmp_path: Path) -> None:
     )
     result = run_cli(path, "--json")
     assert result.return_value == 1
-    (told,) = load_json_document(result)["files"]
-    assert told["windows"] == []
-    assert told["pooled"]["windows_used"] == 0
-    assert told["pooled"]["reasons"][0].startswith("NoWindow")
-    assert told["pooled"]["parameters"]["R"]["value"] is None
-    assert "reason" in told["pooled"]["parameters"]["R"]
+    (reported,) = load_json_document(result)["files"]
+    assert reported["windows"] == []
+    assert reported["pooled"]["windows_used"] == 0
+    assert reported["pooled"]["reasons"][0].startswith("NoWindow")
+    assert reported["pooled"]["parameters"]["R"]["value"] is None
+    assert "reason" in reported["pooled"]["parameters"]["R"]
     assert "NoWindow" in run_cli(path).stdout
 
 
@@ -140,14 +140,14 @@ def test_unreadable_recording_does_not_stop_batch(shuttle: Path, tmp_path: Path)
     first, good, last = load_json_document(result)["files"]
     assert good["pooled"]["validated"] is True
     assert "error" not in good
-    for told, path in ((first, bad), (last, absent)):
-        assert set(told) == {*good, "error"}
-        assert (told["file"], told["axis"], told["windows"]) == (str(path), None, [])
-        assert told["pooled"]["validated"] is False
-        assert told["pooled"]["windows_used"] == 0
-        assert told["pooled"]["parameters"]["R"]["value"] is None
-        assert told["pooled"]["reasons"] == [f"RecordingError: {told['error']['text']}"]
-        assert told["error"]["class"] == "RecordingError"
+    for reported, path in ((first, bad), (last, absent)):
+        assert set(reported) == {*good, "error"}
+        assert (reported["file"], reported["axis"], reported["windows"]) == (str(path), None, [])
+        assert reported["pooled"]["validated"] is False
+        assert reported["pooled"]["windows_used"] == 0
+        assert reported["pooled"]["parameters"]["R"]["value"] is None
+        assert reported["pooled"]["reasons"] == [f"RecordingError: {reported['error']['text']}"]
+        assert reported["error"]["class"] == "RecordingError"
     shown = run_cli(bad, shuttle, absent)
     assert shown.return_value == 3
     assert "all 2" in shown.stdout
@@ -180,11 +180,11 @@ def test_axis_missing_in_config_is_reported(shuttle: Path, tmp_path: Path) -> No
     """Without the axis in the configuration no comparison with nominal values is possible."""
     shuttle.write_text(shuttle.read_text().replace("# axis: X", "# axis: Q", 1))
     (tmp_path / "machine.toml").write_text(_write_config(500.0))
-    (told,) = load_json_document(run_cli(shuttle, "--json", "--config", tmp_path / "machine.toml"))["files"]
-    assert told["pooled"]["validated"] is True
-    assert [text for text in told["pooled"]["warnings"] if "NoSuchAxis: axis Q is not in the configuration" in text]
-    (told,) = load_json_document(run_cli(shuttle, "--json"))["files"]
-    assert "NoSuchAxis" not in str(told)
+    (reported,) = load_json_document(run_cli(shuttle, "--json", "--config", tmp_path / "machine.toml"))["files"]
+    assert reported["pooled"]["validated"] is True
+    assert [text for text in reported["pooled"]["warnings"] if "NoSuchAxis: axis Q is not in the configuration" in text]
+    (reported,) = load_json_document(run_cli(shuttle, "--json"))["files"]
+    assert "NoSuchAxis" not in str(reported)
 
 
 def test_unreadable_recording_exits_3_with_one_sentence(

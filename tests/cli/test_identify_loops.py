@@ -29,9 +29,9 @@ def test_unconfigured_filter_is_reported_and_used(filtered_recording: Path, tmp_
     config = tmp_path / "machine.toml"
     config.write_text(bench_toml())
     result = CliRunner().invoke(cli, ["identify", str(filtered_recording), "--config", str(config), "--json"])
-    (told,) = json.loads(result.stdout)["files"]
-    assert told["pooled"]["validated"]
-    loops = told["loops"]  # identified without --loops, because the configured ones do not explain the rapids
+    (reported,) = json.loads(result.stdout)["files"]
+    assert reported["pooled"]["validated"]
+    loops = reported["loops"]  # identified without --loops, because the configured ones do not explain the rapids
     assert (loops["structure"], loops["configured_structure"]) == ("p_pi_pi", "p_pi_pi")
     found = loops["gains"]["speed_filter_s"]
     assert found["value"] == pytest.approx(0.001, rel=0.06)

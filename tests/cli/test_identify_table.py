@@ -26,8 +26,8 @@ SOFT = Mechanics(resonance_hz=HERTZ)
 def make_signals() -> dict[str, bench.Array]:
     """Return the columns of two rapids of an axis with a compliant screw, including the table position."""
     run = real_plant.simulate_axis(SOFT, DEMAND_M, None, 1e-3)
-    told = real_plant.report_signals(run, SOFT, Sensors(noise=0.001, speed="difference"), 1)
-    return {**told, "table_mm": np.round(1e3 * run.table_m, 4)}
+    reported = real_plant.report_signals(run, SOFT, Sensors(noise=0.001, speed="difference"), 1)
+    return {**reported, "table_mm": np.round(1e3 * run.table_m, 4)}
 
 
 def write_recording(folder: Path, table: bool) -> Path:

@@ -33,8 +33,8 @@ def machine(tmp_path: Path) -> Path:
 def test_r_and_l_are_null_k_is_given_and_terms_are_reported(recording_without_voltage: Path) -> None:
     result = run_cli(recording_without_voltage, "--json")
     assert result.return_value == 0
-    (told,) = load_json_document(result)["files"]
-    pooled = told["pooled"]
+    (reported,) = load_json_document(result)["files"]
+    pooled = reported["pooled"]
     assert (pooled["validated"], pooled["windows_used"]) == (True, 4)
     for name in ("R", "L"):
         assert pooled["parameters"][name]["value"] is None
@@ -43,7 +43,7 @@ def test_r_and_l_are_null_k_is_given_and_terms_are_reported(recording_without_vo
     assert pooled["parameters"]["Jt"]["value"] == pytest.approx(SCREW.Jt, rel=0.01)
     assert set(pooled["terms"]["load"]) == {"value", "std", "unit"}
     assert pooled["terms"]["load"]["unit"] == "N.m"
-    for window in told["windows"]:
+    for window in reported["windows"]:
         assert window["validated"] is True
         assert window["fit_percent"] is None
         assert {"terms", "unexplained_um", "warnings"} <= set(window)
@@ -60,12 +60,12 @@ def test_config_provides_missing_parameters(recording_without_voltage: Path, mac
     alone = run_cli(recording_without_voltage, "--json")
     assert alone.return_value == 1
     assert "torque_constant_nm_per_a" in run_cli(recording_without_voltage).stdout
-    told = load_json_document(run_cli(recording_without_voltage, "--json", "--config", machine))["files"][0]["pooled"][
-        "parameters"
-    ]
-    assert told["K"]["value"] == 0.33
-    assert told["R"]["value"] is None
-    assert told["Jt"]["value"] == pytest.approx(SCREW.Jt * 0.33 / SCREW.K, rel=0.01)
+    reported = load_json_document(run_cli(recording_without_voltage, "--json", "--config", machine))["files"][0][
+        "pooled"
+    ]["parameters"]
+    assert reported["K"]["value"] == 0.33
+    assert reported["R"]["value"] is None
+    assert reported["Jt"]["value"] == pytest.approx(SCREW.Jt * 0.33 / SCREW.K, rel=0.01)
 
 
 def test_predict_reads_written_model_file(recording_without_voltage: Path, machine: Path, tmp_path: Path) -> None:

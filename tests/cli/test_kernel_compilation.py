@@ -42,15 +42,15 @@ def run_python(code: str, **environment: str) -> subprocess.Popen[str]:
 
 
 def test_make_setup_compiles_every_kernel() -> None:
-    told = run_python(UNCALLED).communicate()[0].splitlines()
-    count, *left = told[0].split()
+    reported = run_python(UNCALLED).communicate()[0].splitlines()
+    count, *left = reported[0].split()
     assert int(count) > 30
     assert left == []
     made = re.compile(r"njit|^@(compiled|inlined)$", re.MULTILINE)
     files = set(ROOT.rglob("*.py")) - {ROOT / "model" / "numba_decorators.py"}
     with_kernels = {str(path) for path in files if made.search(path.read_text())}
     assert str(ROOT / "identification" / "kalman.py") in with_kernels
-    assert with_kernels <= set(told[1:])
+    assert with_kernels <= set(reported[1:])
 
 
 def test_parallel_compilation_leaves_usable_cache(tmp_path: Path) -> None:

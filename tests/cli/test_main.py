@@ -64,10 +64,10 @@ def test_errors_are_one_sentence_with_exit_code(capsys: pytest.CaptureFixture[st
         assert run_safely(misconfigured) == 2
     finally:
         sys.argv = argv
-    said = capsys.readouterr().err
-    assert "fdhil: can0: is not there; bring it up" in said
-    assert "axis.X: is missing" in said
-    assert "nc: is no table" in said
+    message = capsys.readouterr().err
+    assert "fdhil: can0: is not there; bring it up" in message
+    assert "axis.X: is missing" in message
+    assert "nc: is no table" in message
 
 
 def test_commands_are_listed_in_workflow_order() -> None:

@@ -164,8 +164,8 @@ def bench_setup(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BenchSetup
 def test_drives_stop_when_play_is_killed(bench_setup: BenchSetup) -> None:
     process = bench_setup.start_play(bench_setup.twin.bus_settings["port"])
     process.send_signal(signal.SIGKILL)
-    said = process.communicate()
-    assert process.returncode == -signal.SIGKILL, said
+    message = process.communicate()
+    assert process.returncode == -signal.SIGKILL, message
     assert bench_setup.read_last_audit_entry() == ("play", None)  # without a result
     assert bench_setup.assert_drives_stopped()
 

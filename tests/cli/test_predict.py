@@ -160,8 +160,8 @@ def test_next_prediction_reports_zone_changes(bench: Path) -> None:
         assert cause["um"] == pytest.approx(zone["change_um"], abs=0.2)
         assert abs(other["um"]) < 0.1
         assert 0 < zone["std_um"] < 5
-        told = {z["where"]: z["max_um"] for z in first["zones"]}
-        assert any(z["before_um"] == pytest.approx(told.get(z["where"], -1.0)) for z in found["zones"])
+        reported = {z["where"]: z["max_um"] for z in first["zones"]}
+        assert any(z["before_um"] == pytest.approx(reported.get(z["where"], -1.0)) for z in found["zones"])
         assert found["rms_um"]["before"] == pytest.approx(first["contour"]["rms_um"])
     text = run_cli(*arguments).stdout
     assert "since this program was predicted on 20" in text

@@ -64,14 +64,14 @@ def test_recorded_demand_equals_program_to_the_increment(
     code, document = recording.end()
     assert (code, document["complete"], document["gaps"]) == (0, True, []), document
     machine = configuration.load_config(config)
-    ordered, heard = (
+    ordered, received = (
         convert_to_increments(load_trajectory(program, machine)),
         convert_to_increments(load_trajectory(out, machine)),
     )
     first = int(np.flatnonzero(np.abs(np.diff(ordered, axis=0)).max(axis=1))[0])  # the first increment that moves
-    rows = min(len(heard), len(ordered) - first)
+    rows = min(len(received), len(ordered) - first)
     assert rows > len(ordered) - 60
-    np.testing.assert_array_equal(heard[:rows], ordered[first : first + rows])
+    np.testing.assert_array_equal(received[:rows], ordered[first : first + rows])
 
 
 def test_recording_without_motion_writes_nothing(simulator: tuple[SimulatorProcess, Path], tmp_path: Path) -> None:

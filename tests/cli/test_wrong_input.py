@@ -176,5 +176,5 @@ def test_missing_sensor_is_reported(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 def test_demo_without_writable_folder_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").touch()
-    said = fdhil("demo", "--out", tmp_path / "file" / "out", capsys=capsys)
-    assert_error(said, 3, "cannot be created: Not a directory; choose another --out")
+    message = fdhil("demo", "--out", tmp_path / "file" / "out", capsys=capsys)
+    assert_error(message, 3, "cannot be created: Not a directory; choose another --out")

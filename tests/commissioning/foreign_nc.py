@@ -50,9 +50,9 @@ class ForeignNc:
         while not self._stopping.is_set():
             message = self._bus.recv(0.001)
             if message is not None and message.arbitration_id in (SYNC, NMT, TARGET, OFFSET, SDO, HEARTBEAT, 0x765):
-                heard = (message.arbitration_id, bytes(message.data))
-                self.sent += [heard] if due else []
-                self.on = self.on or self.when(heard)
+                received = (message.arbitration_id, bytes(message.data))
+                self.sent += [received] if due else []
+                self.on = self.on or self.when(received)
             if self.on and time.monotonic() >= due:
                 while not due and self._bus.recv(0) is not None:
                     pass

@@ -99,9 +99,9 @@ def test_guard_with_cob_id_in_use_is_refused(offset_rpdo: int, whose: str, tmp_p
 def test_cob_id_of_received_node_is_in_use(tmp_path: Path) -> None:
     config = build_config(tmp_path, 0x309)
     assert find_conflict(config, "X") is None
-    for heard in (0x709, 0x089, 0x589, 0x189):
-        clash = find_conflict(config, "X", [0x185, 0x705, heard])
-        assert clash is not None, hex(heard)
+    for received in (0x709, 0x089, 0x589, 0x189):
+        clash = find_conflict(config, "X", [0x185, 0x705, received])
+        assert clash is not None, hex(received)
         assert (
             clash.cause
             == "its RPDO2 has the COB-ID 309, which belongs to RPDO2 of node-ID 9, which was received on the bus"
@@ -157,8 +157,8 @@ def test_guard_does_not_start_on_cob_id_conflict(tmp_path: Path) -> None:
     config = machine_config.parse_config(document, folder=tmp_path)
     save_record(RECORD, config.store.directory)
     with can.Bus(interface="virtual", channel=channel) as bus, pytest.MonkeyPatch.context() as patch:
-        heard = can.Message(arbitration_id=0x709, data=b"\x05", is_extended_id=False)
-        sender = bus.send_periodic(heard, 0.02)
+        received = can.Message(arbitration_id=0x709, data=b"\x05", is_extended_id=False)
+        sender = bus.send_periodic(received, 0.02)
         patch.setattr("fdhil.commissioning.record_comparison.LISTEN_S", 0.3)
         with pytest.raises(ConfigError, match="RPDO2 of node-ID 9, which was received on the bus"):
             verify_commissioned_drives(config, "can0", lambda _text: None)

@@ -148,15 +148,15 @@ def run_step(config: MachineConfig, step: Callable[[Master], None]) -> None:
 def test_step_ends_within_few_syncs_of_another_master(step: str, what: str, rig: Rig) -> None:
     done, when, braking = STEPS[step]
     with rig.start_nc(what, when) as nc:
-        with pytest.raises(ForeignMaster, match=r"an NC is sending .*; switch it off") as told:
+        with pytest.raises(ForeignMaster, match=r"an NC is sending .*; switch it off") as reported:
             run_step(rig.config, done)
         rig.require_drive_released(nc, what, braking)
     left = {
         "target": "axis X was left to that master, its offset set to zero",
         "offset": "X was stopped and its drive switched off, and may hold an offset of that master: power it off",
     }
-    assert left.get(what, "X was stopped, its offset set to zero and its drive switched off") in str(told.value)
-    assert ("0x1016 may be as fdhil wrote" in str(told.value)) is (step in ("watchdog test", "rapid"))
+    assert left.get(what, "X was stopped, its offset set to zero and its drive switched off") in str(reported.value)
+    assert ("0x1016 may be as fdhil wrote" in str(reported.value)) is (step in ("watchdog test", "rapid"))
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -195,11 +195,11 @@ def test_sdo_requests_end_when_another_master_is_detected(
 def test_record_stays_valid_when_nc_starts_during_guard_start(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.record_comparison.LISTEN_S", 0.1)
     sign_off(rig.config)
-    said: list[str] = []
+    message: list[str] = []
     with rig.start_nc("SYNC", lambda frame: frame[0] == SDO) as nc:
-        verify_commissioned_drives(rig.config, "can0", said.append)
+        verify_commissioned_drives(rig.config, "can0", message.append)
         assert nc.sent == []
-    assert said == []
+    assert message == []
 
 
 def test_watchdog_test_ends_on_foreign_heartbeat_with_own_id(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,10 +98,10 @@ def test_pins_and_gains_are_read_from_files(tmp_path: Path) -> None:
     assert not loop.error_previous_target
     assert config.g0.source == "linuxcnc"
     assert config.bus["hal"].offset_lead_cycles > 0
-    told = "\n".join(draft.notes)
-    assert "the card measures no current" in told
-    assert "position is that of the pulses" in told
-    assert "remove this loop" not in told
+    reported = "\n".join(draft.notes)
+    assert "the card measures no current" in reported
+    assert "position is that of the pulses" in reported
+    assert "remove this loop" not in reported
 
 
 def test_gains_of_current_pid_are_converted(tmp_path: Path) -> None:
@@ -140,8 +140,8 @@ def test_pin_missing_in_running_hal_is_refused_by_name(tmp_path: Path) -> None:
     running += ["joint.1.motor-pos-cmd", "joint.1.amp-enable-out", "hm2_7i92.0.stepgen.01.position-fb"]
     with pytest.raises(ConfigError) as refused:
         make_config(tmp_path, read_machine(tmp_path), build_answers(), running)
-    told = {fault.path: fault.what for fault in refused.value.faults}
-    assert told == {
+    reported = {fault.path: fault.what for fault in refused.value.faults}
+    assert reported == {
         f"axis.{x}.drive.hal.current": f"HAL has no pin hm2_7i92.0.7i77.0.1.analogin{k}" for k, x in enumerate("XZ")
     }
 

@@ -173,16 +173,16 @@ def test_record_stores_other_rpdos(peer: tuple[DrivePeer, MachineConfig]) -> Non
 
 def test_record_is_voided_by_new_second_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.record_comparison.LISTEN_S", 0.2)
-    settings, told = build_corrected_config(tmp_path), list[str]()
+    settings, reported = build_corrected_config(tmp_path), list[str]()
     with DrivePeer(settings) as drive:
         record = commission_axis(settings, "X")
         save_record(record, settings.store.directory)
-        verify_commissioned_drives(settings, "can0", told.append)
-        assert told == []
+        verify_commissioned_drives(settings, "can0", reported.append)
+        assert reported == []
         assert make_guard_settings(settings, "can0", tmp_path, "").axes[0].record_void is False
         add_rpdo(drive, 20, 0x3F0, [POSITION_OFFSET])
-        verify_commissioned_drives(settings, "can0", told.append)
-    assert told[0].startswith("RecordVoid: axis X: its RPDO20 (COB-ID 3F0) writes 60B0, as fdhil does")
+        verify_commissioned_drives(settings, "can0", reported.append)
+    assert reported[0].startswith("RecordVoid: axis X: its RPDO20 (COB-ID 3F0) writes 60B0, as fdhil does")
     [axis] = make_guard_settings(settings, "can0", tmp_path, "").axes
     assert axis.record_void is True
     assert axis.void_reason.startswith("its RPDO20 (COB-ID 3F0) writes 60B0")
@@ -266,12 +266,12 @@ def test_frame_carrying_drive_offset_voids_record(
 
 
 def test_frame_of_nc_carrying_offset_voids_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings, told = build_corrected_config(tmp_path), list[str]()
+    settings, reported = build_corrected_config(tmp_path), list[str]()
     save_record(RECORD, settings.store.directory)
     traffic = build_traffic(197, {0x3F0: struct.pack("<i", 197)})
     monkeypatch.setattr("fdhil.commissioning.record_comparison._listen_to_bus", lambda *_: traffic)
-    verify_commissioned_drives(settings, "can0", told.append)
-    assert "the axis cannot be armed or adopted" in told[0]
+    verify_commissioned_drives(settings, "can0", reported.append)
+    assert "the axis cannot be armed or adopted" in reported[0]
     assert is_record_void(settings.store.directory, "X")
 
 

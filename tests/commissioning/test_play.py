@@ -113,9 +113,9 @@ def test_demand_is_played_to_end_after_go_to_start(play_bench: PlayBench) -> Non
     assert code == 1, out
     assert "2.000 mm from the start of the demand; move it there" in json.loads(out)["refused"]
     code, out, _ = fdhil("play", demand, *options, "--go-to-start", capsys=play_bench.capsys)
-    said = json.loads(out)
-    assert (code, said["stopped"], said["played"]) == (0, None, 301)
-    assert said["sync"]["cycles"] >= said["rows"]
+    message = json.loads(out)
+    assert (code, message["stopped"], message["played"]) == (0, None, 301)
+    assert message["sync"]["cycles"] >= message["rows"]
     assert play_bench.read_table_mm() == pytest.approx([2.0, 0.0], abs=0.02)
     assert play_bench.require_switched_off()
     # SYNC, NMT, SDO, heartbeat and targets; only the guard sends offsets
@@ -163,9 +163,9 @@ def test_record_of_drive_that_boots_during_playback_stays_void(play_bench: PlayB
     thread.join()
     guard.close()
     assert code == 0, err
-    told = [request for request in guard.requests if request.get("axes")]
-    assert [sorted(request["axes"]) for request in told] == [["X", "Y"], ["Y"]]  # at its start and at its end
-    assert [request["touched"] for request in told] == [{"X": 4, "Y": 5}] * 2
+    reported = [request for request in guard.requests if request.get("axes")]
+    assert [sorted(request["axes"]) for request in reported] == [["X", "Y"], ["Y"]]  # at its start and at its end
+    assert [request["touched"] for request in reported] == [{"X": 4, "Y": 5}] * 2
     assert [is_record_void(play_bench.config.store.directory, axis) for axis in "XY"] == [True, False]
     assert "RecordVoid: axis X: its drive rebooted after the comparison" in err
     assert "axis Y" not in err
@@ -193,10 +193,10 @@ def test_nothing_is_sent_while_nc_runs_bus(play_bench: PlayBench) -> None:
 
 
 def run_refused(floor: PlayBench, text: str = STROKE, *options: str) -> str:
-    code, said, _ = floor.play_demand(text, *options)
+    code, message, _ = floor.play_demand(text, *options)
     assert code == 1
     assert floor.read_table_mm() == pytest.approx([0.0, 0.0], abs=1e-3)
-    return str(said["refused"])
+    return str(message["refused"])
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -212,8 +212,8 @@ def test_playback_is_refused_on_invalid_preconditions(play_bench: PlayBench, mon
 
 
 def test_demand_outside_travel_is_refused_before_bus_is_opened(play_bench: PlayBench) -> None:
-    code, said, _ = play_bench.play_demand(STROKE, "--dry-run")
-    assert (code, said["would_play"]) == (0, True)
+    code, message, _ = play_bench.play_demand(STROKE, "--dry-run")
+    assert (code, message["would_play"]) == (0, True)
     text = run_refused(play_bench, "G21 G90 G94\nG1 X70 F6000\nM2\n", "--yes")
     assert "axis X: it could not be braked inside its travel (row " in text
     assert "nothing was sent" in text

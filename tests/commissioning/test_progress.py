@@ -23,14 +23,14 @@ def write_progress(folder: Path) -> StepProgress:
 
 def test_step_is_reused_for_same_drive_only(tmp_path: Path) -> None:
     write_progress(tmp_path)
-    told: list[tuple[str, CompletedStep]] = []
+    reported: list[tuple[str, CompletedStep]] = []
     again = StepProgress(tmp_path, "X")
-    again.on_reused = lambda name, step: told.append((name, step))
+    again.on_reused = lambda name, step: reported.append((name, step))
     assert again.reuse_step("sign test", "another drive") is None
     assert again.reuse_step("watchdog test", "this drive") is None
-    assert told == []
+    assert reported == []
     assert again.reuse_step("sign test", "this drive") == FOUND
-    assert [name for name, _ in told] == ["sign test"]
+    assert [name for name, _ in reported] == ["sign test"]
     assert again.list_step_times().keys() == {"sign test"}
     assert StepProgress(tmp_path, "Y").list_step_times() == {}
 

@@ -54,9 +54,9 @@ def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
 
 
 def build_traffic(*rows: Row) -> BusTraffic:
-    heard = BusTraffic()
-    heard.add_frames(pack_frames(rows))
-    return heard
+    received = BusTraffic()
+    received.add_frames(pack_frames(rows))
+    return received
 
 
 @pytest.mark.parametrize(
@@ -85,16 +85,16 @@ def test_master_is_recognised_by_its_frames(can_id: int, data: bytes, master: st
 
 def test_nodes_states_and_heartbeats_are_listed() -> None:
     beats = [(int(k * 5e8), 0x703, bytes([0x7F])) for k in range(4)]
-    heard = build_traffic(*beats, (0, 0x182, bytes(8)), (0, 0x085, b"\x11\x86" + bytes(6)), (0, 0x707, b"\x33"))
-    assert heard.sending_nodes == {2, 3, 5, 7}
-    assert (heard.decode_nmt_state(3), heard.decode_nmt_state(2), heard.decode_nmt_state(7)) == (
+    received = build_traffic(*beats, (0, 0x182, bytes(8)), (0, 0x085, b"\x11\x86" + bytes(6)), (0, 0x707, b"\x33"))
+    assert received.sending_nodes == {2, 3, 5, 7}
+    assert (received.decode_nmt_state(3), received.decode_nmt_state(2), received.decode_nmt_state(7)) == (
         "pre-operational",
         None,
         "unknown (33)",
     )
-    assert heard.measure_heartbeat_s(3) == pytest.approx(0.5)
-    assert heard.measure_heartbeat_s(7) is None
-    assert heard.emergencies == {5: {0x8611}}
+    assert received.measure_heartbeat_s(3) == pytest.approx(0.5)
+    assert received.measure_heartbeat_s(7) is None
+    assert received.emergencies == {5: {0x8611}}
 
 
 def test_single_late_sync_does_not_change_period() -> None:
@@ -111,15 +111,15 @@ def test_node_appearing_during_listing_causes_no_error(
     sys.setswitchinterval(1e-6)  # threads switch as often as possible
     ids = range(0x181, 0x1FF)
     for _ in range(30):
-        heard = BusTraffic()
+        received = BusTraffic()
         coming = threading.Thread(
-            target=heard.add_frames, args=(pack_frames([(0, can_id, bytes(8)) for can_id in ids]),)
+            target=received.add_frames, args=(pack_frames([(0, can_id, bytes(8)) for can_id in ids]),)
         )
         coming.start()
         while coming.is_alive():
-            assert len(heard.sending_nodes) <= len(ids)
+            assert len(received.sending_nodes) <= len(ids)
         coming.join()
-        assert len(heard.sending_nodes) == len(ids)
+        assert len(received.sending_nodes) == len(ids)
     assert build_traffic((0, 0x80, b"")).sync_period_s is None
 
 
@@ -274,8 +274,8 @@ def test_refused_object_does_not_end_check(code: AbortCode, peer: tuple[DrivePee
 
 def test_drive_without_identity_is_not_compared_with_vendor_profile() -> None:
     profile = replace(load_profile(Drive()), vendor_id=0xFB)
-    told = {vendor: compare_identity(profile, DeviceIdentity(vendor, 2, 3, 4)).ok for vendor in (0xFB, 0xFC, 0)}
-    assert told == {0xFB: True, 0xFC: False, 0: None}
+    reported = {vendor: compare_identity(profile, DeviceIdentity(vendor, 2, 3, 4)).ok for vendor in (0xFB, 0xFC, 0)}
+    assert reported == {0xFB: True, 0xFC: False, 0: None}
 
 
 def test_coasting_drive_is_reported_although_other_object_is_missing(peer: tuple[DrivePeer, MachineConfig]) -> None:

@@ -139,16 +139,16 @@ def test_simulated_drive_answers_one_sync_at_a_time_after_sleep(monkeypatch: pyt
         while listener.recv(0) is not None:
             pass
         master.wait_cycles(40)
-        heard = []
+        received = []
         while (message := listener.recv(0)) is not None:
             if message.arbitration_id in (0x080, 0x181, 0x281, 0x381, 0x481):
-                heard.append(message.arbitration_id)
-    syncs = [k for k, can_id in enumerate(heard) if can_id == 0x080]
-    answers = [tuple(heard[a + 1 : b]) for a, b in itertools.pairwise(syncs)]
+                received.append(message.arbitration_id)
+    syncs = [k for k, can_id in enumerate(received) if can_id == 0x080]
+    answers = [tuple(received[a + 1 : b]) for a, b in itertools.pairwise(syncs)]
     assert len(answers) > 30
     assert set(answers) == {(0x181, 0x281), (0x181, 0x281, 0x381, 0x481)}
-    seldom = [k for k, each in enumerate(answers) if len(each) == 4]
-    assert set(np.diff(seldom)) == {10}
+    rarely = [k for k, each in enumerate(answers) if len(each) == 4]
+    assert set(np.diff(rarely)) == {10}
 
 
 def test_object_without_tpdo_is_reported() -> None:

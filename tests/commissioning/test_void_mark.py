@@ -106,7 +106,7 @@ def test_every_record_is_compared_before_guard_starts(tmp_path: Path, monkeypatc
     document = bench_document("XYZ")
     document["axis"]["Z"].pop("correction")
     config = machine_config.parse_config(document, folder=tmp_path)
-    store, told = config.store.directory, list[str]()
+    store, reported = config.store.directory, list[str]()
     compared, nc = list[str](), [True]
 
     def compare(_config: object, record: CommissioningRecord) -> Finding:
@@ -118,19 +118,19 @@ def test_every_record_is_compared_before_guard_starts(tmp_path: Path, monkeypatc
         "fdhil.commissioning.record_comparison._listen_to_bus", lambda *_: BusTraffic(sync_ns=[1] * nc[0])
     )
     monkeypatch.setattr("fdhil.commissioning.record_comparison.compare_drive", compare)
-    verify_commissioned_drives(config, "can0", told.append)
+    verify_commissioned_drives(config, "can0", reported.append)
     for axis in "XYZ":
         save_record(replace(RECORD, axis=axis), store)
     mark_record_void(store, "Y", "booted")
-    verify_commissioned_drives(config, "can0", told.append)
-    assert compared == told == []  # with an NC on the bus nothing is read
+    verify_commissioned_drives(config, "can0", reported.append)
+    assert compared == reported == []  # with an NC on the bus nothing is read
     assert is_record_void(store, "Y")
     nc[0] = False
-    verify_commissioned_drives(config, "can0", told.append)
+    verify_commissioned_drives(config, "can0", reported.append)
     assert compared == ["X", "Y"]
     assert is_record_void(store, "X")
     assert not is_record_void(store, "Y")
-    assert told == ["RecordVoid: axis X: it differs; the axis cannot be armed or adopted; mend it"]
+    assert reported == ["RecordVoid: axis X: it differs; the axis cannot be armed or adopted; mend it"]
     (store / "commissioning-X.json").write_text("damaged")
-    verify_commissioned_drives(config, "can0", told.append)
+    verify_commissioned_drives(config, "can0", reported.append)
     assert compared == ["X", "Y", "Y"]

@@ -40,18 +40,18 @@ def run_passes(count: int, loops: Loops, wear: float = 0.0, disturbed: int = -1)
     config, reference = bench_config(), build_bench_trajectory(10)
     models = dict.fromkeys(reference.axes, Parameters.from_mapping(REAL.truth()).replace_values(Cd=5.2))
     offset = plan_correction(reference, models, config).offset_um
-    lesson, mechanics = LearnedOffset.make_empty(reference), REAL
+    offsets, mechanics = LearnedOffset.make_empty(reference), REAL
     learned, alone = [], []
     for number in range(count):
         if number == disturbed:
-            lesson = replace(lesson, offset_um={axis: u + 20.0 for axis, u in lesson.offset_um.items()})
-        rough = {axis: offset[axis] + lesson.offset_um[axis] for axis in reference.axes}
+            offsets = replace(offsets, offset_um={axis: u + 20.0 for axis, u in offsets.offset_um.items()})
+        rough = {axis: offset[axis] + offsets.offset_um[axis] for axis in reference.axes}
         at = simulate_pass(mechanics, loops, reference, fit_all_axes(rough, config.axis, reference.dt_s))
         learned.append(compute_residual_um(reference, at))
         alone.append(compute_residual_um(reference, simulate_pass(mechanics, loops, reference, offset)))
         error_um = {axis: (reference.position_mm[axis] - at[axis]) * 1e3 for axis in reference.axes}
-        lesson = learn_from_pass(lesson, error_um, learned[-1], models, config)
-        make_bounded_config(lesson, config)
+        offsets = learn_from_pass(offsets, error_um, learned[-1], models, config)
+        make_bounded_config(offsets, config)
         mechanics = replace(mechanics, Cd=mechanics.Cd * (1 - wear))
     return learned, alone
 
@@ -60,8 +60,8 @@ def compute_residual_um(reference: Trajectory, at: Mapping[str, Float]) -> float
     return compute_rms(compute_contour_error_um(reference.path_mm, np.column_stack(list(at.values())), reference.dt_s))
 
 
-def make_bounded_config(lesson: LearnedOffset, config: MachineConfig) -> None:
-    for axis, offset in lesson.offset_um.items():
+def make_bounded_config(learned: LearnedOffset, config: MachineConfig) -> None:
+    for axis, offset in learned.offset_um.items():
         limits = config.axis[axis].correction
         assert limits is not None
         assert float(np.abs(offset).max()) <= MOST_SHARE * limits.max_offset_um

@@ -170,10 +170,10 @@ class Audit(Plain):
 
 class LearnedOffsets(Plain):
     def keep(self, number: int) -> None:
-        lesson = LearnedOffset({"X": np.full(50, float(number))}, float(number), 1.0, (float(number),))
+        learned = LearnedOffset({"X": np.full(50, float(number))}, float(number), 1.0, (float(number),))
         with patch.object(learned_offset_files, "MOST_PROGRAMS", WINDOWS_KEPT):
             learned_offset_files.write_learned(
-                learned_offset_files.make_learned_path(self.folder / "lessons", f"{number:032d}", "made"), lesson
+                learned_offset_files.make_learned_path(self.folder / "lessons", f"{number:032d}", "made"), learned
             )
 
     def found(self) -> set[int]:
@@ -181,8 +181,8 @@ class LearnedOffsets(Plain):
             int(program): lesson
             for _, program, lesson in learned_offset_files.list_learned(self.folder / "lessons", "made")
         }
-        for number, lesson in there.items():
-            whole = np.array_equal(lesson.offset_um["X"], np.full(50, number)) and lesson.curve_um == (float(number),)
+        for number, learned in there.items():
+            whole = np.array_equal(learned.offset_um["X"], np.full(50, number)) and learned.curve_um == (float(number),)
             assert whole, f"lesson {number} is another"
         gone = range(1, max(there, default=0)) if len(there) >= WINDOWS_KEPT else range(0)
         return {*there, *gone}

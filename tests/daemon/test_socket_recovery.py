@@ -76,11 +76,11 @@ async def test_removed_token_is_written_again(tmp_path: Path) -> None:
     config = config_of(tmp_path)
     run = config.run_directory
     run.mkdir(parents=True)
-    desk = ArmingService(config, OutcomeStore(config), run)
-    desk.start_from_history({}, [])
+    service = ArmingService(config, OutcomeStore(config), run)
+    service.start_from_history({}, [])
     before = read_token(run)
     (run / TOKEN_NAME).unlink()
-    notice = await restore_access(desk, "")
+    notice = await restore_access(service, "")
     assert (notice.code, notice.severity, read_token(run)) == ("SocketLost", "minor", before)
 
 
@@ -88,15 +88,15 @@ async def test_daemon_disarms_when_its_socket_cannot_be_recovered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = config_of(tmp_path)
-    desk = ArmingService(config, OutcomeStore(config), config.run_directory)
+    service = ArmingService(config, OutcomeStore(config), config.run_directory)
     disarmed = []
 
     async def disarm() -> Mapping[str, Any]:
         disarmed.append(True)
         return {"ok": True}
 
-    monkeypatch.setattr(desk, "disarm", disarm)
+    monkeypatch.setattr(service, "disarm", disarm)
     for trouble in ("the disk is read-only", ""):  # the second time the token's folder is not there
-        notice = await restore_access(desk, trouble)
+        notice = await restore_access(service, trouble)
         assert (notice.code, notice.severity) == ("SocketLost", "MAJOR")
     assert disarmed == [True, True]

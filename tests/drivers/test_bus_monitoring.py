@@ -86,9 +86,9 @@ def test_paused_simulated_machine_misses_no_sync() -> None:
 def test_repeatedly_lost_counter_end_does_not_shorten_its_range() -> None:
     """Otherwise every later row would be one too early."""
     grid = SyncGrid(0.001)
-    heard = [k for k in range(1000) if k not in (239, 479, 718, 719)]
-    got = np.concatenate([grid.assign_ticks(pack_frames(build_syncs([k]))).syncs.tick for k in heard])
-    assert got.tolist() == heard
+    received = [k for k in range(1000) if k not in (239, 479, 718, 719)]
+    got = np.concatenate([grid.assign_ticks(pack_frames(build_syncs([k]))).syncs.tick for k in received])
+    assert got.tolist() == received
     assert grid.missed == 4
 
 
@@ -163,10 +163,10 @@ def test_sync_with_and_without_counter_is_a_collision() -> None:
 @pytest.mark.parametrize("every", [2, 3, 5])
 def test_lost_syncs_are_not_a_collision(every: int) -> None:
     grid = SyncGrid(0.001)
-    heard = [k for k in range(600) if k % every]
-    notices = [n for k in heard for n in grid.assign_ticks(pack_frames(build_syncs([k]))).notices]
+    received = [k for k in range(600) if k % every]
+    notices = [n for k in received for n in grid.assign_ticks(pack_frames(build_syncs([k]))).notices]
     assert notices == []
-    assert grid.missed == heard[-1] - heard[0] + 1 - len(heard)
+    assert grid.missed == received[-1] - received[0] + 1 - len(received)
 
 
 @pytest.mark.parametrize("overflow", [2, 3, 10, 100, 200, 239, 240])
@@ -247,38 +247,40 @@ def test_lost_heartbeat_and_its_return_are_reported() -> None:
 def test_intermittent_heartbeat_is_one_outage() -> None:
     """Four at 20 ms each second for half a minute: two notices, not two a second."""
     watch = NodeMonitor("X", 1)
-    told = []
+    reported = []
     for t in range(0, 30_000, 1000):
-        told += watch.watch_frames(pack_frames(build_heartbeats([t, t + 20, t + 40, t + 60])), (t + 60) * MS)
-        told += watch.watch_frames(pack_frames([]), (t + 500) * MS)
-    assert [n.severity for n in told] == ["MAJOR"]
-    told = [
+        reported += watch.watch_frames(pack_frames(build_heartbeats([t, t + 20, t + 40, t + 60])), (t + 60) * MS)
+        reported += watch.watch_frames(pack_frames([]), (t + 500) * MS)
+    assert [n.severity for n in reported] == ["MAJOR"]
+    reported = [
         n for t in range(30_000, 36_000, 20) for n in watch.watch_frames(pack_frames(build_heartbeats([t])), t * MS)
     ]
-    assert [n.severity for n in told] == ["info"]
+    assert [n.severity for n in reported] == ["info"]
 
 
 def test_boot_during_an_outage_is_the_same_outage() -> None:
     """After a power-up with heartbeats before the boot-up message the daemon once ended."""
     watch = NodeMonitor("X", 1)
     watch.watch_frames(pack_frames(build_heartbeats([0, 100, 200, 300])), 300 * MS)
-    told = watch.watch_frames(pack_frames([]), 2000 * MS)
-    told += watch.watch_frames(pack_frames(build_heartbeats([2100, 2200])), 2200 * MS)
-    told += watch.watch_frames(pack_frames(build_heartbeats([2300], 0)), 2300 * MS)
-    told += [n for t in range(2400, 6000, 100) for n in watch.watch_frames(pack_frames(build_heartbeats([t])), t * MS)]
-    assert [(n.code, n.severity) for n in told] == [
+    reported = watch.watch_frames(pack_frames([]), 2000 * MS)
+    reported += watch.watch_frames(pack_frames(build_heartbeats([2100, 2200])), 2200 * MS)
+    reported += watch.watch_frames(pack_frames(build_heartbeats([2300], 0)), 2300 * MS)
+    reported += [
+        n for t in range(2400, 6000, 100) for n in watch.watch_frames(pack_frames(build_heartbeats([t])), t * MS)
+    ]
+    assert [(n.code, n.severity) for n in reported] == [
         ("HeartbeatLost", "MAJOR"), ("NodeRebooted", "MAJOR"), ("HeartbeatLost", "info")
     ]  # fmt: skip
 
 
 @given(st.lists(st.tuples(st.integers(0, 3000), st.sampled_from([0, 4, 5, 0x7F, 0x85, 0x33])), max_size=60))
 def test_any_node_traffic_gives_one_begin_and_one_end_per_outage(said: list[tuple[int, int]]) -> None:
-    watch, t, told = NodeMonitor("X", 1), 0, []
+    watch, t, reported = NodeMonitor("X", 1), 0, []
     for later, state in said:
         t += later
-        told += watch.watch_frames(pack_frames([]), t * MS)
-        told += watch.watch_frames(pack_frames(build_heartbeats([t], state)), t * MS)
-    lost = [n.severity for n in told if n.code == "HeartbeatLost"]
+        reported += watch.watch_frames(pack_frames([]), t * MS)
+        reported += watch.watch_frames(pack_frames(build_heartbeats([t], state)), t * MS)
+    lost = [n.severity for n in reported if n.code == "HeartbeatLost"]
     assert lost == ["MAJOR", "info"] * (len(lost) // 2) + ["MAJOR"] * (len(lost) % 2)
 
 

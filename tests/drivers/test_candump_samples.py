@@ -21,10 +21,10 @@ from tests.drivers.test_pdo_decoder import check_rows, decode_all
 def test_candump_log_gives_the_samples_of_the_bus() -> None:
     wire = FrameBuilder()
     found = decode_candump(format_candump("can0", wire.build_frames()).encode(), build_machine_config())["X"]
-    heard, _, _ = decode_all([wire.build_frames()])
+    received, _, _ = decode_all([wire.build_frames()])
     assert found.lost == 0
     for name in ("tick", "position_mm", "current_a", "offset_mm"):
-        np.testing.assert_array_equal(getattr(found, name), heard[name])
+        np.testing.assert_array_equal(getattr(found, name), received[name])
     check_rows(wire, {field.name: getattr(found, field.name) for field in fields(found)})
 
 

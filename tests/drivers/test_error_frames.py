@@ -68,11 +68,11 @@ def test_each_error_class_has_a_text(row: tuple[int, int, bytes], expected: tupl
 
 def test_flood_of_error_frames_is_reported_once_and_counted() -> None:
     watch = ErrorFrameMonitor()
-    told = [
+    reported = [
         list_codes(watch, k * 0.05, *[build_error_frame(k * 50_000_000 + j, 0x008, 0, 0, 4) for j in range(100)])
         for k in range(50)
     ]
-    assert [code for block in told for code in block] == [("BusErrors", "minor")]
+    assert [code for block in reported for code in block] == [("BusErrors", "minor")]
     assert watch.count == 5000
     assert list_codes(watch, 20.0) == [("BusErrors", "info")]
     assert list_codes(watch, 21.0, build_error_frame(21_000_000_000, 0x008)) == [("BusErrors", "minor")]
@@ -98,7 +98,7 @@ def test_bus_off_lasts_until_a_frame_is_received() -> None:
 
 def test_repeated_bus_off_is_one_fault() -> None:
     watch = ErrorFrameMonitor()
-    told = [
+    reported = [
         list_codes(
             watch,
             k,
@@ -108,5 +108,5 @@ def test_repeated_bus_off_is_one_fault() -> None:
         )
         for k in range(9)
     ]
-    assert told == [[("BusOff", "MAJOR"), ("BusRestarted", "MAJOR")], *[[]] * 8]
+    assert reported == [[("BusOff", "MAJOR"), ("BusRestarted", "MAJOR")], *[[]] * 8]
     assert list_codes(watch, 30.0, build_data_frame(30 * 10**9)) == [("BusOff", "info")]

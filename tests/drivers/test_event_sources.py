@@ -108,8 +108,8 @@ def test_every_listed_source_reports_a_rapid_under_its_name(name: str) -> None:
         ticks = np.arange(first, min(first + 50, demand.size))
         events += source.detect_moves(TickTimes(freeze_integers(ticks), freeze_integers(ticks * 1_000_000)))
         for tick in ticks[::10].tolist():
-            said = MoveKind.RAPID if high[tick] else MoveKind.REST
-            events += source.detect_moves(NcState(tick * 1_000_000, 5_000_000, said))
+            message = MoveKind.RAPID if high[tick] else MoveKind.REST
+            events += source.detect_moves(NcState(tick * 1_000_000, 5_000_000, message))
         events += source.detect_moves(build_samples(demand[ticks], first))
         inputs = np.where(high[ticks[::10]], 1 << config.g0.input_bit, 0)
         events += source.detect_moves(InputSamples("X", freeze_integers(ticks[::10]), freeze_integers(inputs)))

@@ -57,8 +57,8 @@ def test_controller_stamps_are_used_when_available(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(socketcan_port, "convert_to_monotonic_ns", lambda wall_ns, ahead_ns: wall_ns - ahead_ns)
     port = open_port()
     late = [0, 3 * MS, 2 * MS, 1 * MS, 0, 7 * MS]
-    told = [port._read_stamp(read_stamps(100 * S + k * MS + late[k], 5 * S + k * MS), 40 * S) for k in range(6)]
-    assert told == [60 * S + k * MS for k in range(6)]
+    reported = [port._read_stamp(read_stamps(100 * S + k * MS + late[k], 5 * S + k * MS), 40 * S) for k in range(6)]
+    assert reported == [60 * S + k * MS for k in range(6)]
     assert port.stamps == "hardware"
 
 

@@ -150,5 +150,5 @@ async def test_libmodbus_master_reads_the_simulated_sensors(libmodbus_program: P
         port = str(served.wires.ready["X"]["port"])
         for arguments in (("tcp-master", "127.0.0.1", port, "0"), ("rtu-master", str(tmp_path / "meter"), "9", "0")):
             master = await asyncio.create_subprocess_exec(libmodbus_program, *arguments, stdout=subprocess.PIPE)
-            said, _ = await master.communicate()
-            assert said == b"-12.3400\n"
+            message, _ = await master.communicate()
+            assert message == b"-12.3400\n"

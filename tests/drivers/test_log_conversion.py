@@ -58,9 +58,9 @@ def convert_file(text: str, target: str, folder: Path, source: str = "candump") 
     """Write a log, convert it, and return the converted file."""
     log, out = folder / f"in{get_suffix(source)}", folder / f"out{get_suffix(target)}"
     log.write_text(text)
-    told = convert_log(log, source, target)
-    out.write_bytes(told.content)
-    return out, told
+    reported = convert_log(log, source, target)
+    out.write_bytes(reported.content)
+    return out, reported
 
 
 def convert_round_trip(text: str, name: str, folder: Path) -> str:
@@ -73,15 +73,15 @@ def test_every_frame_survives_every_format(name: str, tmp_path: Path) -> None:
     assert convert_round_trip(CANDUMP, name, tmp_path) == CANDUMP
     undated = CANDUMP.replace("(17145576", "(1")  # as the black box has them: since the computer was switched on
     assert convert_round_trip(undated, name, tmp_path) == undated
-    _, told = convert_file(CANDUMP, name, tmp_path)
-    assert (told.frames, told.left_out, told.reduced) == (13, {}, {})
+    _, reported = convert_file(CANDUMP, name, tmp_path)
+    assert (reported.frames, reported.left_out, reported.reduced) == (13, {}, {})
 
 
 def test_command_reports_kept_and_left_out_frames(tmp_path: Path, capsys: Any) -> None:
     log, out = tmp_path / "bus.log", tmp_path / "bus.trc"
     log.write_text(CANDUMP + ERRORS)
-    code, told, err = fdhil("export", log, "--out", out, "--json", capsys=capsys)
-    found = json.loads(told)
+    code, reported, err = fdhil("export", log, "--out", out, "--json", capsys=capsys)
+    found = json.loads(reported)
     assert (code, found["frames"], found["left_out"], found["reduced"]) == (0, 13, {"error frames": 3}, {})
     assert found["buses"] == {"can0": 1, "can1": 2}
     assert "3 error frames: omitted from" in err
@@ -93,9 +93,9 @@ def test_error_frames_keep_their_class_where_the_format_has_one(tmp_path: Path) 
     for name in ("candump", "blf"):
         assert convert_round_trip(ERRORS, name, tmp_path) == ERRORS
         assert convert_file(ERRORS, name, tmp_path)[1].reduced == {}
-    out, told = convert_file(ERRORS, "asc", tmp_path)
+    out, reported = convert_file(ERRORS, "asc", tmp_path)
     assert out.read_text().count("ErrorFrame") == 3
-    assert told.reduced == {"class and data of error frames": 2}
+    assert reported.reduced == {"class and data of error frames": 2}
     assert convert_round_trip(ERRORS, "asc", tmp_path).count("20000080#0000000000000000") == 3
     with pytest.raises(RecordingError, match="3 error frames, which trc cannot hold"):
         convert_file(ERRORS, "trc", tmp_path)
@@ -149,13 +149,13 @@ def test_logs_of_python_can_are_read(name: str, tmp_path: Path) -> None:
     with can.Logger(theirs) as writer:
         for message in read_with_python_can(log):
             writer.on_message_received(message)
-    told = convert_log(theirs, name, "candump")
-    came = told.content.decode().splitlines()
+    reported = convert_log(theirs, name, "candump")
+    came = reported.content.decode().splitlines()
     assert [line.split()[1:3] for line in came] == [line.split()[1:3] for line in wanted]
     if name != "asc":  # whose head has milliseconds alone, cut off
         assert [line.split()[0] for line in came] == [line.split()[0] for line in wanted]
-    assert told.left_out == {}
-    assert set(told.reduced) <= ({"times finer than 1 us"} if name == "blf" else set())  # of its floats
+    assert reported.left_out == {}
+    assert set(reported.reduced) <= ({"times finer than 1 us"} if name == "blf" else set())  # of its floats
 
 
 def read_with_python_can(path: Path, **options: Any) -> list[can.Message]:
@@ -188,8 +188,8 @@ def test_bus_names_are_kept_in_a_remark(name: str, tmp_path: Path) -> None:
 
 
 def test_bus_names_that_blf_cannot_hold_are_counted(tmp_path: Path) -> None:
-    _, told = convert_file("(12.000100) vcan0 080#\n(12.000200) can0 080#\n", "blf", tmp_path)
-    assert told.reduced == {"names of buses": 1}
+    _, reported = convert_file("(12.000100) vcan0 080#\n(12.000200) can0 080#\n", "blf", tmp_path)
+    assert reported.reduced == {"names of buses": 1}
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -204,8 +204,8 @@ def test_sent_frames_and_decreasing_times_are_kept(name: str, tmp_path: Path) ->
 )
 def test_nanoseconds_are_kept_or_counted(name: str, lost: dict[str, int], tmp_path: Path) -> None:
     text = "(1714557600.249713123) can0 080#\n(1714557600.250000000) can0 080#\n"
-    out, told = convert_file(text, name, tmp_path)
-    assert told.reduced == lost
+    out, reported = convert_file(text, name, tmp_path)
+    assert reported.reduced == lost
     if name == "candump":
         assert out.read_text() == text
     if name == "blf":
@@ -259,11 +259,11 @@ def test_any_frames_survive_conversion_or_are_counted(
     wanted = [frame for frame in (expect_frames(frame, name) for frame in sent) if frame is not None]
     if not wanted:
         return
-    out, told = convert_file(text, name, folder)
+    out, reported = convert_file(text, name, folder)
     module = import_module(f"fdhil.drivers.can.{name}_log")
     came = list(module.read(out, Counter()))
-    assert told.frames == len(came) == len(sent) - sum(told.left_out.values())
-    renamed = {"vcan0": f"can{int(told.buses['vcan0']) - 1}"} if name == "blf" and "vcan0" in told.buses else {}
+    assert reported.frames == len(came) == len(sent) - sum(reported.left_out.values())
+    renamed = {"vcan0": f"can{int(reported.buses['vcan0']) - 1}"} if name == "blf" and "vcan0" in reported.buses else {}
     for got, frame in zip(came, wanted, strict=True):
         assert (got.t_ns, got.bus) == (frame.t_ns, renamed.get(frame.bus, frame.bus))
         assert (got.can_id, got.dlc, got.data, got.fd) == (frame.can_id, frame.dlc, frame.data, frame.fd)
@@ -330,10 +330,10 @@ Begin Triggerblock Mit Mai 1 10:00:00.250 am 2024
 End TriggerBlock
 """
     (tmp_path / "bus.asc").write_text(text)
-    told = convert_log(tmp_path / "bus.asc", "asc", "candump")
+    reported = convert_log(tmp_path / "bus.asc", "asc", "candump")
     start = int(datetime(2024, 5, 1, 10).timestamp())
-    assert told.left_out == {"events that are not CAN frames": 2}
-    assert told.content.decode().splitlines() == [
+    assert reported.left_out == {"events that are not CAN frames": 2}
+    assert reported.content.decode().splitlines() == [
         f"({start}.{stamp}) {rest}"
         for stamp, rest in [
             ("251000", "can0 181#01 R"),
@@ -357,9 +357,9 @@ def test_symbolic_identifier_is_refused_with_its_line(tmp_path: Path) -> None:
 
 def test_decimal_asc_without_date_is_read_and_reported(tmp_path: Path) -> None:
     (tmp_path / "bus.asc").write_text("base dec  timestamps absolute\n   0.5 1  385             Rx   d 2 16 255\n")
-    told = convert_log(tmp_path / "bus.asc", "asc", "candump")
-    assert told.content == b"(0.500000) can0 181#10FF\n"
-    assert told.reduced == {"the date, which is unreadable": 1}
+    reported = convert_log(tmp_path / "bus.asc", "asc", "candump")
+    assert reported.content == b"(0.500000) can0 181#10FF\n"
+    assert reported.reduced == {"the date, which is unreadable": 1}
 
 
 def test_trigger_date_applies_only_to_times_counted_from_it(tmp_path: Path) -> None:
@@ -396,15 +396,15 @@ def test_trc_of_every_version_is_read(version: str, tmp_path: Path) -> None:
     dated = version != "1.0"
     head = f";$FILEVERSION={version}\n;$STARTTIME=45413.4166666667\n" if dated else ";   Start time: 11.09.2002\n"
     (tmp_path / "bus.trc").write_text(head + COLUMNS.get(version, "") + "".join(f"   {row}\n" for row in TRC[version]))
-    told = convert_log(tmp_path / "bus.trc", "trc", "candump")
+    reported = convert_log(tmp_path / "bus.trc", "trc", "candump")
     start, part = (1714557600, "003") if dated else (0, "000")
-    assert told.content.decode() == (
+    assert reported.content.decode() == (
         f"({start + 1}.841{part}) can0 181#010203\n"
         f"({start + 1}.842{part}) can0 20000080#0000000000000000\n"
         f"({start + 1}.844{part}) can0 18FF1234#R3\n"
     )
-    assert told.left_out == {"lines that are not CAN frames": 1}
-    assert told.reduced == ({} if dated else {"the date, which is not in the header": 1})
+    assert reported.left_out == {"lines that are not CAN frames": 1}
+    assert reported.reduced == ({} if dated else {"the date, which is not in the header": 1})
 
 
 def test_fd_flags_match_peaks_types(tmp_path: Path) -> None:
@@ -414,11 +414,11 @@ def test_fd_flags_match_peaks_types(tmp_path: Path) -> None:
 
 
 def test_truncated_blf_counts_the_missing_objects(tmp_path: Path) -> None:
-    out, told = convert_file(CANDUMP * 40, "blf", tmp_path)
-    out.write_bytes(told.content[:-400])
+    out, reported = convert_file(CANDUMP * 40, "blf", tmp_path)
+    out.write_bytes(reported.content[:-400])
     cut = convert_log(out, "blf", "candump")
-    assert 0 < cut.frames < told.frames
-    assert cut.left_out == {"objects that are not CAN frames": told.frames - cut.frames}
+    assert 0 < cut.frames < reported.frames
+    assert cut.left_out == {"objects that are not CAN frames": reported.frames - cut.frames}
 
 
 def test_log_is_not_a_recording_and_empty_log_is_refused(tmp_path: Path, capsys: Any) -> None:
@@ -437,7 +437,7 @@ def test_log_is_not_a_recording_and_empty_log_is_refused(tmp_path: Path, capsys:
 @given(st.sampled_from(FORMATS), st.binary(max_size=200), st.integers(0, 900))
 def test_any_bytes_are_read_or_refused(tmp_path_factory: Any, name: str, junk: bytes, keep: int) -> None:
     folder = tmp_path_factory.mktemp("log")
-    out, told = convert_file(CANDUMP, name, folder)
-    out.write_bytes(told.content[:keep] + junk)
+    out, reported = convert_file(CANDUMP, name, folder)
+    out.write_bytes(reported.content[:keep] + junk)
     with contextlib.suppress(RecordingError):
         convert_log(out, name, "candump")

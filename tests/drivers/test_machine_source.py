@@ -25,7 +25,7 @@ def create_source() -> MachineSource:
 
 
 async def test_exception_of_a_source_is_raised_by_the_machine_source(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[Record] = []
+    message: list[Record] = []
 
     async def run(bus: BusSource, take: Take) -> None:
         take(Notice("BusDown", "MAJOR", f"bus {bus.name}"))
@@ -33,8 +33,8 @@ async def test_exception_of_a_source_is_raised_by_the_machine_source(monkeypatch
 
     monkeypatch.setattr(BusSource, "run", run)
     with pytest.raises(RuntimeError, match="a fault of the decoder"):
-        await create_source().run(said.append)
-    assert [record.text for record in said if isinstance(record, Notice)] == ["bus can0"]
+        await create_source().run(message.append)
+    assert [record.text for record in message if isinstance(record, Notice)] == ["bus can0"]
 
 
 async def test_failing_consumer_ends_the_machine_source(monkeypatch: pytest.MonkeyPatch) -> None:

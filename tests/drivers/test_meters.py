@@ -135,8 +135,10 @@ def test_reserved_unit_number_is_used_with_a_remark() -> None:
     for place, remarks in (({"device": "/dev/ttyUSB0"}, 1), ({"port": 502, "framing": "rtu"}, 1), ({"port": 502}, 0)):
         voltage = {"source": "modbus", "type": "uint16", "unit": 248, "period_s": 0.5, **place}
         made = parse_config({"machine": {"name": "bench"}, "axis": {"X": bench_axis(corrected=False, voltage=voltage)}})
-        told = [text for text in find_unlikely_values(made) if "axis.X.voltage.unit = 248 is outside 1 to 247" in text]
-        assert len(told) == remarks
+        reported = [
+            text for text in find_unlikely_values(made) if "axis.X.voltage.unit = 248 is outside 1 to 247" in text
+        ]
+        assert len(reported) == remarks
 
 
 async def test_float_at_register_0_needs_only_its_type(tmp_path: Path) -> None:
@@ -158,22 +160,22 @@ async def test_two_meters_and_a_thermometer_share_a_line(tmp_path: Path) -> None
         def take(record: Record) -> None:
             found.append(record)
             if isinstance(record, VoltageSamples | Temperature):
-                heard[getattr(record, "sensor", "thermometer " + record.axis)].set()
+                received[getattr(record, "sensor", "thermometer " + record.axis)].set()
 
         sensors = [*served.sensors("X").values(), *served.sensors("Y").values()]
-        heard = {sensor.name: asyncio.Event() for sensor in sensors}
+        received = {sensor.name: asyncio.Event() for sensor in sensors}
         sources = [SensorSource(sensor, TickClock(0.001)) for sensor in sensors]
         async with asyncio.timeout(300):
             tasks = [asyncio.create_task(source.run(take)) for source in sources]
             for sensor in sensors:
-                await heard[sensor.name].wait()
+                await received[sensor.name].wait()
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         for source in sources:
             source.close()
-    told = {(r.axis, round(float(v), 6)) for r in found if isinstance(r, VoltageSamples) for v in r.voltage_v}
-    assert told == {("X", -12.34), ("Y", 45.6)}
+    reported = {(r.axis, round(float(v), 6)) for r in found if isinstance(r, VoltageSamples) for v in r.voltage_v}
+    assert reported == {("X", -12.34), ("Y", 45.6)}
     assert {round(r.celsius, 6) for r in found if isinstance(r, Temperature)} == {21.5}
 
 

@@ -314,7 +314,7 @@ def test_repeated_samples_are_used_once() -> None:
 def test_torn_count_is_discarded_once_and_then_accepted(tear: int, lasting: bool) -> None:
     sensor, ticks = ModbusVoltage("X", build_config(1)), TickClock(0.001)
     taken: list[int] = []
-    told: list[str] = []
+    reported: list[str] = []
     for poll in range(6):
         newest = 200_039 + 40 * poll + (tear if poll == 3 or (lasting and poll > 3) else 0)
         block = SensorBlock(newest, 1000.0, np.nan, False, newest - 99, np.zeros(100), 0.0)
@@ -322,9 +322,9 @@ def test_torn_count_is_discarded_once_and_then_accepted(tear: int, lasting: bool
             if isinstance(record, VoltageSamples):
                 taken += record.counter.tolist()
             elif isinstance(record, Notice):
-                told.append(record.code)
-    assert told[0] == "RegisterTear"
-    assert told.count("RegisterTear") == 1
+                reported.append(record.code)
+    assert reported[0] == "RegisterTear"
+    assert reported.count("RegisterTear") == 1
     if not lasting:
         assert np.all(np.diff(taken) == 1)
         assert sensor.lost == 0

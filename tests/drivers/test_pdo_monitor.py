@@ -73,16 +73,16 @@ def test_lost_frames_of_a_present_tpdo_are_counted() -> None:
 
 def test_event_driven_tpdo_is_reported_and_not_counted_lost() -> None:
     """The default of most drives: transmission type 255."""
-    seldom = {LATE.time_ns(k, 0.1) for k in range(0, LATE.n, 37)}
-    rows = [(t, i, d) for t, i, d in LATE.build_rows() if i != TPDO1 or t in seldom]
+    rarely = {LATE.time_ns(k, 0.1) for k in range(0, LATE.n, 37)}
+    rows = [(t, i, d) for t, i, d in LATE.build_rows() if i != TPDO1 or t in rarely]
     decoder = BusDecoder("can0", build_machine_config())
-    told = [
+    reported = [
         each.text
         for start in range(0, len(rows), 200)
         for each in decoder.decode_frames(pack_frames(rows[start : start + 200]), rows[start][0])
         if isinstance(each, Notice)
     ]
-    assert told == [
+    assert reported == [
         "Drive X sends TPDO1 (181) with few of the SYNCs, so its samples have gaps; "
         "set the transmission type (0x1800:02) to 1, or check that it is still Operational."
     ]

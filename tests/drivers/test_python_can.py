@@ -47,11 +47,11 @@ class SerialAdapter:
 
     def received_text(self, last: str) -> str:
         """Return what the adapter received up to a line end; a terminal may split it anywhere."""
-        said = ""
-        while last + "\r" not in said:
-            assert select.select([self.end], [], [], 100)[0], said
-            said += os.read(self.end, 4096).decode()
-        return said
+        message = ""
+        while last + "\r" not in message:
+            assert select.select([self.end], [], [], 100)[0], message
+            message += os.read(self.end, 4096).decode()
+        return message
 
     def close(self) -> None:
         for descriptor in (self.end, self.line):
@@ -79,8 +79,8 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 def test_serial_adapter_receives_and_never_acknowledges(adapter: SerialAdapter) -> None:
     with ListeningBus("can0", build_settings(adapter)) as bus:
-        assert "S8\r" in (said := adapter.received_text("L"))  # 1 Mbit/s
-        assert "O\r" not in said
+        assert "S8\r" in (message := adapter.received_text("L"))  # 1 Mbit/s
+        assert "O\r" not in message
         adapter.send_text("t0800", "t18181122334455667788", "T000001232AABB", "r2810")
         wait_for(lambda: bus.read_counters()["frames"] == 4)
         frames = bus.drain_frames()
@@ -144,9 +144,9 @@ def test_drive_is_sampled_through_a_serial_adapter(adapter: SerialAdapter, monke
         source.close()
     assert np.array_equal(decode_samples(got), expected)
     assert expected.shape[1] > 380
-    told = [record for record in got if isinstance(record, Notice)]
-    assert [notice.code for notice in told] == ["CoarseStamps"]
-    assert "some 10 ms late" in told[0].text
+    reported = [record for record in got if isinstance(record, Notice)]
+    assert [notice.code for notice in reported] == ["CoarseStamps"]
+    assert "some 10 ms late" in reported[0].text
     assert source.read_counters()["lost"] == 0
 
 
@@ -160,9 +160,9 @@ def decode_samples(records: Iterable[object]) -> npt.NDArray[np.float64]:
 @pytest.mark.parametrize("interface", ADAPTERS)
 def test_missing_adapter_is_reported(interface: str) -> None:
     settings = BusSettings.model_validate({"interface": interface, "channel": "0"})
-    with pytest.raises(ConnectError, match=f"the {interface} adapter 0 cannot be opened .*or use SocketCAN") as said:
+    with pytest.raises(ConnectError, match=f"the {interface} adapter 0 cannot be opened .*or use SocketCAN") as message:
         ListeningBus("can0", settings)
-    assert "\n" not in str(said.value)
+    assert "\n" not in str(message.value)
 
 
 @pytest.mark.parametrize("interface", ADAPTERS)

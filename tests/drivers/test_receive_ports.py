@@ -111,9 +111,9 @@ def test_sent_frames_follow_the_socketcand_protocol(hub: MiniHub) -> None:
         bus.send(0x301, b"\x01\xff")
         bus.send(0x80, b"")
         wait_for(lambda: hub.commands.count(b">") >= 2)
-        said = hub.received_text()
+        message = hub.received_text()
     assert hub.commands == b"< open can0 >< rawmode >"
-    assert said.startswith(b"< send 301 2 1 ff >")
+    assert message.startswith(b"< send 301 2 1 ff >")
 
 
 def test_closed_hub_connection_ends_the_bus(hub: MiniHub) -> None:

@@ -134,8 +134,8 @@ def test_lines_become_accelerations_on_the_sync_count() -> None:
 
 def test_lost_lines_are_reported_and_counts_can_wrap() -> None:
     sensor = create_accelerometer()
-    told = sensor.accept_lines(build_lines([10, 11, 14]), build_tick_clock())
-    assert [r.code for r in told if isinstance(r, Notice)] == ["SampleTiming"]
+    reported = sensor.accept_lines(build_lines([10, 11, 14]), build_tick_clock())
+    assert [r.code for r in reported if isinstance(r, Notice)] == ["SampleTiming"]
     assert sensor.lost == 2
     wrapping = create_accelerometer()
     wrapping.accept_lines(

@@ -45,8 +45,8 @@ class OfferSigner:
 
 def create_machine(works: OfferSigner, folder: Path, *more: str, **uplink: Any) -> Path:
     """Write the configuration of a machine that trusts the fleet server, with comments, and return its file."""
-    told = {"axis_labels": {"X": {"screw": "A"}, "Y": {"screw": "B"}}} | uplink
-    file = write_history(folder, **told)
+    reported = {"axis_labels": {"X": {"screw": "A"}, "Y": {"screw": "B"}}} | uplink
+    file = write_history(folder, **reported)
     text = file.read_text().replace("ft = 0.05", "ft = 0.05  # by the data sheet", 1)
     tail = "\n".join(["", "# what follows is the operator's", "[offers]", f'trust = ["{works.public}"]', *more, ""])
     file.write_text(text + tail)

@@ -81,12 +81,12 @@ async def test_service_is_recorded_with_its_changes(
     code, text = asked("service", *words, "--note", "lubricated")
     assert (code, "age and limits count from then" in text) == (0, True)
     code, out = asked("services", "--json")
-    (told,) = json.loads(out)["services"]
-    change = next(each for each in told["changes"] if each["parameter"] == "ft")
+    (reported,) = json.loads(out)["services"]
+    change = next(each for each in reported["changes"] if each["parameter"] == "ft")
     assert change["low"] < -0.01 < change["high"] < 0.0  # 20 % of 0.05
     assert change["before"] == pytest.approx(0.06, rel=0.01)
     assert change["sure"]
-    assert not next(each for each in told["changes"] if each["parameter"] == "R")["sure"]
+    assert not next(each for each in reported["changes"] if each["parameter"] == "R")["sure"]
     assert f"{day}T00:00:00+00:00  mill-1 axis X  lubricated" in asked("services")[1]
 
     with open_read_only(build_fleet(database, tmp_path)) as db:

@@ -132,9 +132,9 @@ async def test_two_machines_with_one_name_are_reported(
     messages = [begun[0], begun[1], *later]
     await collect_messages(build_fleet(database, tmp_path), [message for part in messages for message in part])
     document, text = query(capsys, 0, "status", fleet_settings)
-    (told,) = document["machines"]
-    assert "two machines use this name" in told["doubt"]
-    assert told["missing"] == 0
+    (reported,) = document["machines"]
+    assert "two machines use this name" in reported["doubt"]
+    assert reported["missing"] == 0
     assert "give each machine a unique name" in text
 
 
@@ -203,9 +203,9 @@ async def test_views_match_documentation(database: Postgres, tmp_path: Path) -> 
     columns = database.execute_query(f"""SELECT {listed} FROM information_schema.columns
         LEFT JOIN information_schema.views v USING (table_schema, table_name)
         WHERE table_schema = 'fleet' AND (v.table_name IS NOT NULL OR table_name = 'services') GROUP BY 1""")
-    told = [f"| `{name}` | {names} |" for name, names in columns]
+    reported = [f"| `{name}` | {names} |" for name, names in columns]
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "fleet.md").read_text("utf-8")
-    assert [line for line in told if line not in page] == []
+    assert [line for line in reported if line not in page] == []
     # whatever is in it, each can be read
     for name, _ in columns:
         database.execute_query(f"SELECT * FROM fleet.{name}")

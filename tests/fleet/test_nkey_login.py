@@ -32,15 +32,15 @@ def read_public_key(pair: nkeys.KeyPair) -> str:
 
 def create_token(subject: nkeys.KeyPair, issuer: nkeys.KeyPair, name: str, claims: dict[str, Any]) -> str:
     """Return the claims of ``issuer`` about ``subject``, signed in the form of NATS."""
-    told: dict[str, Any] = {
+    reported: dict[str, Any] = {
         "iat": 1_800_000_000,
         "iss": read_public_key(issuer),
         "name": name,
         "sub": read_public_key(subject),
     }
-    told["nats"] = claims | {"version": 2}
-    told["jti"] = base64.b32encode(hashlib.sha256(json.dumps(told).encode()).digest()).decode().rstrip("=")
-    parts = [_encode_plain({"typ": "JWT", "alg": "ed25519-nkey"}), _encode_plain(told)]
+    reported["nats"] = claims | {"version": 2}
+    reported["jti"] = base64.b32encode(hashlib.sha256(json.dumps(reported).encode()).digest()).decode().rstrip("=")
+    parts = [_encode_plain({"typ": "JWT", "alg": "ed25519-nkey"}), _encode_plain(reported)]
     signed = base64.urlsafe_b64encode(issuer.sign(".".join(parts).encode())).decode().rstrip("=")
     return ".".join([*parts, signed])
 

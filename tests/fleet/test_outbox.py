@@ -189,8 +189,8 @@ def test_damaged_or_deleted_row_is_reported_as_such(machine: RecordingMachine) -
     change_database(machine, "DELETE FROM notices")
     change_database(machine, "UPDATE outbox SET row = 2 WHERE of = 'skills' AND axis = 'X'")
     with read_outbox(machine) as reader:
-        told = {(entry.axis, entry.kind): entry.left_out for entry in reader.read_entries(0, 10)}
-    assert told == {
+        reported = {(entry.axis, entry.kind): entry.left_out for entry in reader.read_entries(0, 10)}
+    assert reported == {
         ("X", "window"): "",
         ("X", "parameters"): "damaged",
         ("X", "skill"): "damaged",

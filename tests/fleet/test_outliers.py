@@ -142,8 +142,8 @@ def test_false_alarm_rate_is_one_in_hundred_groups(kind: str) -> None:
 
 def test_nine_of_ten_outliers_are_found_at_study_threshold() -> None:
     figures = json.loads((FOLDER / "sisters.json").read_text("utf-8"))["figures"]
-    told = figures["least_found"]["one"][figures["sizes"].index(12)]
-    assert sisters.compute_detected_share(12, 1, told, 60, seed=4) > 0.75  # by chance less than once in 10,000
+    reported = figures["least_found"]["one"][figures["sizes"].index(12)]
+    assert sisters.compute_detected_share(12, 1, reported, 60, seed=4) > 0.75  # by chance less than once in 10,000
 
 
 def test_uncertain_values_cause_no_outlier() -> None:

@@ -121,10 +121,10 @@ def test_time_and_axis_limit_reanalysis(fleet_settings: Path, capsys: pytest.Cap
 def test_window_is_assessed_with_machine_configuration(
     fleet_settings: Path, tmp_path: Path, database: Postgres, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = run_query(
+    reported = run_query(
         capsys, 0, fleet_settings, "--method", "least_squares", "--config", tmp_path / "1" / "machine.toml"
     )
-    assert (told["windows"], told["without_config"]) == (12, 6)
+    assert (reported["windows"], reported["without_config"]) == (12, 6)
     query = "SELECT DISTINCT machine, unexplained_um IS NULL FROM fleet.reanalysed ORDER BY 1"
     assert database.execute_query(query) == [("mill-0", True), ("mill-1", False)]
 
@@ -138,10 +138,10 @@ def test_unreadable_window_is_reported_and_retried(
     path = window_files.build_window_path(tmp_path / "objects", name)
     content = path.read_bytes()
     path.write_bytes(content[:-100])
-    told = run_query(capsys, 3, fleet_settings, "--method", "least_squares")
-    assert (told["windows"], told["unreadable"]) == (12, 1)
-    assert ["damaged" in (each["error"] or "") for each in told["listed"]].count(True) == 1
-    assert run_query(capsys, 3, fleet_settings, "--method", "least_squares")["digest"] == told["digest"]
+    reported = run_query(capsys, 3, fleet_settings, "--method", "least_squares")
+    assert (reported["windows"], reported["unreadable"]) == (12, 1)
+    assert ["damaged" in (each["error"] or "") for each in reported["listed"]].count(True) == 1
+    assert run_query(capsys, 3, fleet_settings, "--method", "least_squares")["digest"] == reported["digest"]
     path.write_bytes(content)
     again = run_query(capsys, 0, fleet_settings, "--method", "least_squares")
     assert (again["windows"], again["unreadable"]) == (12, 0)
@@ -168,10 +168,10 @@ slowly({str(fleet_settings)!r})
     wait_until(lambda: database.execute_query(held) == [], "the database has seen that it is gone")
     done = len(database.execute_query(ROWS))
     assert done == 4
-    told: list[tuple[int, int]] = []
-    with open_worker_pool(None, 0, per_task=1) as crew:
-        resume_run(fleet_settings, crew, lambda *far: told.append(far))
-    assert told == [(k, 12 - done) for k in range(13 - done)]  # what was done is not done again
+    reported: list[tuple[int, int]] = []
+    with open_worker_pool(None, 0, per_task=1) as pool:
+        resume_run(fleet_settings, pool, lambda *far: reported.append(far))
+    assert reported == [(k, 12 - done) for k in range(13 - done)]  # what was done is not done again
     assert database.execute_query(ROWS) == alone
     assert run_query(capsys, 0, fleet_settings, "--method", "least_squares")["digest"] == whole["digest"]
 
@@ -220,8 +220,8 @@ def test_reanalysis_survives_lost_cluster(
             "--scheduler",
             address,
         ]
-        told = subprocess.run([*command, "--method", "least_squares", "--json"], capture_output=True, check=True)
-        assert json.loads(told.stdout)["digest"] == alone["digest"]
+        reported = subprocess.run([*command, "--method", "least_squares", "--json"], capture_output=True, check=True)
+        assert json.loads(reported.stdout)["digest"] == alone["digest"]
         worker.send_signal(signal.SIGSTOP)  # nothing gets done
         again = subprocess.Popen([*command, "--method", "partial_moments"], stderr=subprocess.PIPE, text=True)
         wait_until(lambda: len(database.execute_query("SELECT 1 FROM fleet.reanalyses")) == 2, "it is at work")
@@ -234,26 +234,26 @@ def test_reanalysis_survives_lost_cluster(
 
 def analyse_slowly(file: str) -> None:
     """Reanalyse with two workers, one window per task, in a process to be killed: the fourth task never ends."""
-    with open_worker_pool(None, 2, per_task=1) as crew:
-        resume_run(Path(file), crew, lambda done, total: time.sleep(600 if done == 4 else 0))
+    with open_worker_pool(None, 2, per_task=1) as pool:
+        resume_run(Path(file), pool, lambda done, total: time.sleep(600 if done == 4 else 0))
 
 
-def resume_run(file: Path, crew: WindowCrew, progress: reanalysis.Progress) -> None:
+def resume_run(file: Path, pool: WindowCrew, progress: reanalysis.Progress) -> None:
     """Complete the revision of the old method."""
     fleet = load_fleet_config(file)
     method = AnalysisMethod(BEFORE, {}, fleet.objects.directory.resolve(), compute_code_digest())
-    reanalysis.reanalyse_windows(fleet, method, reanalysis.WindowScope(), crew, progress)
+    reanalysis.reanalyse_windows(fleet, method, reanalysis.WindowScope(), pool, progress)
 
 
 def test_only_one_process_works_on_a_revision(fleet_settings: Path, database: Postgres, tmp_path: Path) -> None:
     fleet = build_fleet(database, tmp_path)
     method = AnalysisMethod(BEFORE, {}, fleet.objects.directory, compute_code_digest())
-    with open_worker_pool(None, 0) as crew:
-        revision = reanalysis.reanalyse_windows(fleet, method, reanalysis.WindowScope(axis="Y"), crew)
-    with open_database(fleet) as other, open_worker_pool(None, 0) as crew:
+    with open_worker_pool(None, 0) as pool:
+        revision = reanalysis.reanalyse_windows(fleet, method, reanalysis.WindowScope(axis="Y"), pool)
+    with open_database(fleet) as other, open_worker_pool(None, 0) as pool:
         other.execute("SELECT pg_advisory_lock(%s, %s)", (reanalysis._LOCK, revision))
         with pytest.raises(StoreError, match="another fdhil fleet reanalyse"):
-            reanalysis.reanalyse_windows(fleet, method, reanalysis.WindowScope(), crew)
+            reanalysis.reanalyse_windows(fleet, method, reanalysis.WindowScope(), pool)
 
 
 def test_non_numeric_value_does_not_break_report(
@@ -271,5 +271,5 @@ def test_non_numeric_value_does_not_break_report(
             f"""UPDATE fleet.records SET record = jsonb_set(record, '{{parameters}}', '{text}') || '{{"reasons": 7}}'
             WHERE kind = 'window' AND machine = 'mill-0' AND (record->>'number')::int = {k + 1}"""
         )
-    told = run_query(capsys, 0, fleet_settings, "--method", "least_squares")
-    assert {each["windows"] for each in told["moved"]} == {5}
+    reported = run_query(capsys, 0, fleet_settings, "--method", "least_squares")
+    assert {each["windows"] for each in reported["moved"]} == {5}

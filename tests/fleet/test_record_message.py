@@ -90,8 +90,8 @@ def test_joined_records_are_split_in_order(most_bytes: int) -> None:
     assert all(count == 1 or len(message.payload) <= most_bytes for message, count in sent)
     records = [decode_message(message.subject, message.payload) for message, _ in sent]
     assert [len(told) for told in records] == [count for _, count in sent]
-    told = [record for each in records for record in each if isinstance(record, Record)]
-    assert [(record.sequence, record.window) for record in told] == list(enumerate(WINDOWS, 1))
+    reported = [record for each in records for record in each if isinstance(record, Record)]
+    assert [(record.sequence, record.window) for record in reported] == list(enumerate(WINDOWS, 1))
 
 
 def test_invalid_record_does_not_affect_others() -> None:
@@ -118,8 +118,8 @@ def test_truncated_message_loses_only_truncated_records() -> None:
     payload = b"".join(part.payload for part in parts)
     ends = [sum(len(part.payload) for part in parts[: k + 1]) for k in range(3)]
     for cut in range(1, len(payload)):
-        told = decode_message(parts[0].subject, payload[:cut])
-        assert sum(isinstance(each, Record) for each in told) == sum(end <= cut for end in ends)
+        reported = decode_message(parts[0].subject, payload[:cut])
+        assert sum(isinstance(each, Record) for each in reported) == sum(end <= cut for end in ends)
 
 
 NAMES = ("schema", "store", "axis", "kind", "message", "sequence", "recorded_s", "window_bytes")
@@ -136,9 +136,9 @@ def build_payload(told: Mapping[str, Any]) -> bytes:
 
 def read_refusal(payload: bytes, subject: str = "fdhil.v1.mill-1.records") -> str:
     """Return why the single part of a message is invalid."""
-    (told,) = decode_message(subject, payload)
-    assert isinstance(told, UnreadableRecord)
-    return told.reason
+    (reported,) = decode_message(subject, payload)
+    assert isinstance(reported, UnreadableRecord)
+    return reported.reason
 
 
 @pytest.mark.parametrize(
@@ -185,8 +185,8 @@ def test_number_out_of_range_is_refused(number: bytes) -> None:
 
 @pytest.mark.parametrize("number", [b"0e999", b"0." + 400 * b"0", b"1e99", b"5e-324", b"1e-0300"])
 def test_number_within_float_range_is_accepted(number: bytes) -> None:
-    (told,) = decode_message("fdhil.v1.mill-1.records", build_payload(GOOD).replace(b"0.05", number))
-    assert isinstance(told, Record)
+    (reported,) = decode_message("fdhil.v1.mill-1.records", build_payload(GOOD).replace(b"0.05", number))
+    assert isinstance(reported, Record)
 
 
 @pytest.mark.parametrize("subject", ["", "fdhil.v1.mill 1.records", "fdhil.v1.m.X.records", "fdhil.v2.m.records"])
@@ -227,6 +227,6 @@ JSON = st.recursive(
 def test_arbitrary_bytes_are_records_or_refused(change: dict[str, Any], cut: int) -> None:
     raw = build_payload(GOOD | change)
     for payload in (raw, raw[:cut], raw[:cut] + b"\n" + raw[cut:], raw + raw[cut:]):
-        for told in decode_message("fdhil.v1.mill-1.records", payload):
-            if isinstance(told, Record):
-                json.dumps(json.loads(told.text), allow_nan=False, ensure_ascii=False).encode()
+        for reported in decode_message("fdhil.v1.mill-1.records", payload):
+            if isinstance(reported, Record):
+                json.dumps(json.loads(reported.text), allow_nan=False, ensure_ascii=False).encode()

@@ -42,8 +42,8 @@ class FakeStream:
     @property
     def list_records(self) -> list[Record]:
         """All accepted records, in that order."""
-        told = [told for message in self.taken.values() for told in decode_message(*message)]
-        return [record for record in told if isinstance(record, Record)]
+        reported = [told for message in self.taken.values() for told in decode_message(*message)]
+        return [record for record in reported if isinstance(record, Record)]
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ async def test_unavailable_server_is_retried_later() -> None:
 
 def test_only_own_machine_name_is_sent(tmp_path: Path) -> None:
     names: dict[str, dict[str, Any]] = {"mill_1__X": {}, "line-3": {"machine": "line-3"}}
-    for told, settings in names.items():
-        machine = RecordingMachine(write_history(tmp_path / told, "mill 1: X", **settings))
-        assert create_sender(machine).machine == told
+    for reported, settings in names.items():
+        machine = RecordingMachine(write_history(tmp_path / reported, "mill 1: X", **settings))
+        assert create_sender(machine).machine == reported
         machine.close_store()

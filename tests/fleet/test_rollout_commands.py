@@ -54,26 +54,28 @@ def place_offer(works: OfferSigner, file: Path, **changes: Any) -> MachineConfig
 
 def test_offer_is_carried_to_machine_by_hand(offer_signer: OfferSigner, config_file: Path, capsys: Any) -> None:
     Path("change.toml").write_text(CHANGE)
-    _, said, _ = fdhil("fleet", "key", "works.key", capsys=capsys)
-    assert said.splitlines() == ["works.key exists already; its public key, for [offers] trust of each machine:",
+    _, message, _ = fdhil("fleet", "key", "works.key", capsys=capsys)
+    assert message.splitlines() == ["works.key exists already; its public key, for [offers] trust of each machine:",
                                  offer_signer.public]  # fmt: skip
     signed = ["fleet", "sign", "change.toml", "--key", "works.key", "--by", "Anna", "--machine", "mill-1"]
     assert fdhil(*signed, "--out", "stick.offer", capsys=capsys)[0] == 0
     before = config_file.read_bytes()
-    code, said, _ = fdhil("offers", "list", config_file, "stick.offer", capsys=capsys)
+    code, message, _ = fdhil("offers", "list", config_file, "stick.offer", capsys=capsys)
     assert (code, config_file.read_bytes()) == (0, before)
-    assert said.splitlines()[:3] == [
+    assert message.splitlines()[:3] == [
         "friction version 3, stage 1, by Anna: Friction, from twelve machines",
         "  axis.X.nominal.ft 0.05 -> 0.061",
         "  maintenance.ft 1 -> 0.8",
     ]
-    code, said, _ = fdhil("offers", "accept", config_file, "stick.offer", "--by", "Bert", capsys=capsys)
+    code, message, _ = fdhil("offers", "accept", config_file, "stick.offer", "--by", "Bert", capsys=capsys)
     assert code == 0
-    assert "machine.toml.before-friction-3" in said
-    assert said.splitlines()[-1].endswith("still uses the old configuration: systemctl restart fdhil; nothing is armed")
-    code, said, _ = fdhil("offers", "list", config_file, "stick.offer", "--json", capsys=capsys)
-    (told,) = json.loads(said)["offers"]
-    assert (told["changes"], told["answers"][0]["by"]) == ([], "Bert")
+    assert "machine.toml.before-friction-3" in message
+    assert message.splitlines()[-1].endswith(
+        "still uses the old configuration: systemctl restart fdhil; nothing is armed"
+    )
+    code, message, _ = fdhil("offers", "list", config_file, "stick.offer", "--json", capsys=capsys)
+    (reported,) = json.loads(message)["offers"]
+    assert (reported["changes"], reported["answers"][0]["by"]) == ([], "Bert")
 
 
 def test_acceptance_is_in_audit_log(offer_signer: OfferSigner, config_file: Path, capsys: Any) -> None:
@@ -84,9 +86,9 @@ def test_acceptance_is_in_audit_log(offer_signer: OfferSigner, config_file: Path
         fdhil("offers", "reject", config_file, "friction", "--by", "Bert\x1b[2J", "--reason", "no", capsys=capsys)[0]
         == 0
     )
-    told = [{key: entry.get(key) for key in ("by", "asked", "answered", "offer", "result")} for entry, _ in
+    reported = [{key: entry.get(key) for key in ("by", "asked", "answered", "offer", "result")} for entry, _ in
             audit_file.read_entries(store)]  # fmt: skip
-    assert told == [
+    assert reported == [
         {"by": "Bert", "asked": "accept an offer", "answered": None, "offer": "friction", "result": None},
         {"by": "Bert", "asked": None, "answered": "accept an offer", "offer": "friction", "result": "done"},
         {"by": "Bert\\x1b[2J", "asked": "reject an offer", "answered": None, "offer": "friction", "result": None},
@@ -109,16 +111,16 @@ def test_offer_is_not_accepted_when_audit_log_fails(offer_signer: OfferSigner, c
 
 def test_refused_offer_exits_1_with_reason(offer_signer: OfferSigner, config_file: Path, capsys: Any) -> None:
     place_offer(offer_signer, config_file, expires_s=NOW - 5)
-    code, _, said = fdhil("offers", "accept", config_file, "friction", "--by", "Bert", capsys=capsys)
+    code, _, message = fdhil("offers", "accept", config_file, "friction", "--by", "Bert", capsys=capsys)
     assert code == 1
-    assert "it expired on" in said
+    assert "it expired on" in message
     assert "cannot be accepted: it expired on" in fdhil("offers", "list", config_file, capsys=capsys)[1]
     place = offer_signer.write_document()
     place.write_bytes(b"junk")
     assert fdhil("offers", "list", config_file, place, capsys=capsys)[0] == 1
     assert fdhil("offers", "list", config_file, "absent.offer", capsys=capsys)[0] == 3
-    code, _, said = fdhil("offers", "accept", config_file, "wear", "--by", "Bert", capsys=capsys)
-    assert (code, "choose one of: friction" in said) == (2, True)
+    code, _, message = fdhil("offers", "accept", config_file, "wear", "--by", "Bert", capsys=capsys)
+    assert (code, "choose one of: friction" in message) == (2, True)
     for by in ("", " ", "x" * 65):
         assert fdhil("offers", "accept", config_file, "friction", "--by", by, capsys=capsys)[0] == 2
 
@@ -144,10 +146,10 @@ def test_invalidated_records_are_listed(offer_signer: OfferSigner, config_file: 
     )
     for axis in "XY":
         save_record(replace(RECORD, axis=axis, config_digest=compute_axis_digest(config, axis)), config.store.directory)
-    said = fdhil("offers", "list", config_file, capsys=capsys)[1]
-    assert "the commissioning record of axis X becomes invalid" in said
-    assert "record of axis Y" not in said
-    assert "arming is refused until the axes are identified again" in said
+    message = fdhil("offers", "list", config_file, capsys=capsys)[1]
+    assert "the commissioning record of axis X becomes invalid" in message
+    assert "record of axis Y" not in message
+    assert "arming is refused until the axes are identified again" in message
 
 
 def test_machine_without_trusted_keys_refuses_offer(offer_signer: OfferSigner, config_file: Path, capsys: Any) -> None:
@@ -186,8 +188,8 @@ def test_daemon_notifies_offer_once_until_answered(offer_signer: OfferSigner, co
 def test_invalid_change_exits_2(old: str, new: str, words: str, offer_signer: OfferSigner, capsys: Any) -> None:
     Path("change.toml").write_text(CHANGE.replace(old, new))
     signed = ["fleet", "sign", "change.toml", "--key", "works.key", "--by", "Anna", "--machine", "mill-1"]
-    code, _, said = fdhil(*signed, "--out", "stick.offer", capsys=capsys)
-    assert (code, words in said, Path("stick.offer").exists()) == (2, True, False), said
+    code, _, message = fdhil(*signed, "--out", "stick.offer", capsys=capsys)
+    assert (code, words in message, Path("stick.offer").exists()) == (2, True, False), message
 
 
 def test_daemon_tracks_only_present_offers(offer_signer: OfferSigner, config_file: Path) -> None:

@@ -56,13 +56,13 @@ class AcceptanceScenario(Plain):
 
     def keep(self, number: int) -> None:
         words = ["offers", "accept", self.file, self.offers / f"{number}.offer", "--by", "Bert"]
-        said = io.StringIO()
-        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(said):
+        message = io.StringIO()
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(message):
             patch.setattr("sys.argv", ["fdhil", *map(str, words)])
             with contextlib.redirect_stdout(io.StringIO()):
                 code = run_safely(cli)
         if code:
-            raise RefusedAcceptance(said.getvalue().replace(" (check", "; check"))
+            raise RefusedAcceptance(message.getvalue().replace(" (check", "; check"))
 
     def found(self) -> set[int]:
         """Return the recorded accepted versions; AssertionError for a file that never existed in this form.
@@ -110,9 +110,9 @@ def test_acceptance_is_atomic_at_any_failing_call(
 @pytest.mark.usefixtures("processes")
 def test_full_disk_undoes_no_acceptance(offers: Path, tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
-    told = disks.filled(AcceptanceScenario, tmp_path / "disk", free_bytes=0)
-    assert (told.wrong, told.ended) == ([], True)
-    assert set(told.kept) - {9} <= set(told.found)
-    assert 1 in told.found
-    assert told.refused
-    assert all("the disk is full" in text or "No space left" in text for text in told.refused)
+    reported = disks.filled(AcceptanceScenario, tmp_path / "disk", free_bytes=0)
+    assert (reported.wrong, reported.ended) == ([], True)
+    assert set(reported.kept) - {9} <= set(reported.found)
+    assert 1 in reported.found
+    assert reported.refused
+    assert all("the disk is full" in text or "No space left" in text for text in reported.refused)

@@ -56,8 +56,8 @@ class FleetRig:
         self.fleet = build_fleet_settings(folder, server, database)
         self.change = folder / "change.toml"
         self.change.write_text(CHANGE)
-        told = {"server": server.url}
-        self.files = {name: create_machine(self.works, folder / name, machine=name, **told) for name in MACHINES}
+        reported = {"server": server.url}
+        self.files = {name: create_machine(self.works, folder / name, machine=name, **reported) for name in MACHINES}
 
     def config(self, name: str) -> MachineConfig:
         return machine_config.load_config(self.files[name])

@@ -265,9 +265,9 @@ def test_answers_of_wrong_types_are_damage(tmp_path: Path) -> None:
         write_file(tmp_path / ANSWERS_FILE, b"")
         (tmp_path / ANSWERS_FILE).unlink()
         add_decision(tmp_path, right)
-        told = json.loads((tmp_path / ANSWERS_FILE).read_text())
-        told["answers"].append({name: getattr(wrong, name) for name in OfferDecision.__slots__})
-        (tmp_path / ANSWERS_FILE).write_text(json.dumps(told))
+        reported = json.loads((tmp_path / ANSWERS_FILE).read_text())
+        reported["answers"].append({name: getattr(wrong, name) for name in OfferDecision.__slots__})
+        (tmp_path / ANSWERS_FILE).write_text(json.dumps(reported))
         with pytest.raises(StoreError):
             read_decisions(tmp_path)
 

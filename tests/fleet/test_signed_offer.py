@@ -48,7 +48,7 @@ def test_signed_offer_round_trips(offer_signer: OfferSigner) -> None:
 @pytest.mark.parametrize("bit", [0x01, 0x20, 0x80])
 def test_any_changed_byte_is_detected(bit: int, offer_signer: OfferSigner) -> None:
     document = offer_signer.sign_document()
-    believed = []
+    accepted = []
     for at in range(len(document)):
         changed = bytearray(document)
         changed[at] ^= bit
@@ -56,8 +56,8 @@ def test_any_changed_byte_is_detected(bit: int, offer_signer: OfferSigner) -> No
             read_offer(bytes(changed), {offer_signer.public})
         except OfferRefused:
             continue
-        believed.append(at)
-    assert believed == []
+        accepted.append(at)
+    assert accepted == []
 
 
 def test_truncated_extended_or_doubled_offer_is_refused(offer_signer: OfferSigner) -> None:
@@ -94,13 +94,13 @@ def test_signed_offer_not_in_canonical_form_is_refused(offer_signer: OfferSigner
 
     line = encode_canonical(Offer(**TOLD))
     assert read_offer(sign_line(line), {offer_signer.public}).version == 3
-    told = json.loads(line)
+    reported = json.loads(line)
     wrong = [
         line.replace(b'"version":3', b'"version":"3"'),
         line.replace(b'"version":3', b'"version":2,"version":3'),
         line.replace(b":", b": ", 1),
-        json.dumps(told | {"values": {"guard.node_id": 5}}, sort_keys=True, separators=(",", ":")).encode(),
-        json.dumps(told | {"more": 1}, sort_keys=True, separators=(",", ":")).encode(),
+        json.dumps(reported | {"values": {"guard.node_id": 5}}, sort_keys=True, separators=(",", ":")).encode(),
+        json.dumps(reported | {"more": 1}, sort_keys=True, separators=(",", ":")).encode(),
         b"[" * 5000,
         b"",
         b"\xff",
@@ -167,10 +167,10 @@ def test_larger_limit_loosens_and_smaller_one_does_not() -> None:
 
 def test_key_file_readable_by_others_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "key"
-    told = create_key(file)
+    reported = create_key(file)
     assert file.stat().st_mode & 0o777 == 0o600
-    assert read_public_key(file) == told
-    assert Offers(trust=(told,)).trust == (told,)
+    assert read_public_key(file) == reported
+    assert Offers(trust=(reported,)).trust == (reported,)
     with pytest.raises(FileExistsError):
         create_key(file)
     file.chmod(0o640)
@@ -188,9 +188,9 @@ def test_key_file_readable_by_others_is_refused(tmp_path: Path) -> None:
 
 
 def test_mistyped_key_is_reported(tmp_path: Path) -> None:
-    told = create_key(tmp_path / "key")
-    for at in range(len(told)):
-        wrong = told[:at] + ("A" if told[at] != "A" else "B") + told[at + 1 :]
+    reported = create_key(tmp_path / "key")
+    for at in range(len(reported)):
+        wrong = reported[:at] + ("A" if reported[at] != "A" else "B") + reported[at + 1 :]
         with pytest.raises(ValidationError, match="mistyped"):
             Offers(trust=(wrong,))
     user = nkeys.from_seed(nkeys.encode_seed(b"7" * 32, nkeys.PREFIX_BYTE_USER)).public_key.decode()

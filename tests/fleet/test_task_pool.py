@@ -49,26 +49,26 @@ def double_numbers(numbers: Sequence[int]) -> list[int]:
 
 
 def test_each_item_runs_once_in_tasks_of_given_size() -> None:
-    crew: TaskPool[int, int] = TaskPool(InProcessExecutor(), 4, 1)
-    tasks = list(crew.run_tasks(lambda numbers: [2 * number for number in numbers], iter(range(10))))
+    pool: TaskPool[int, int] = TaskPool(InProcessExecutor(), 4, 1)
+    tasks = list(pool.run_tasks(lambda numbers: [2 * number for number in numbers], iter(range(10))))
     assert [list(task) for task, _ in tasks] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
     assert [result for _, results in tasks for result in results] == [2 * k for k in range(10)]
-    assert list(crew.run_tasks(double_numbers, [])) == []
+    assert list(pool.run_tasks(double_numbers, [])) == []
 
 
 def test_only_item_that_kills_worker_is_lost() -> None:
-    crew: TaskPool[int, int] = TaskPool(ThreadExecutor(), 8, 3, (WorkerDied,), lambda number: -number)
+    pool: TaskPool[int, int] = TaskPool(ThreadExecutor(), 8, 3, (WorkerDied,), lambda number: -number)
     results = {
         item: result
-        for task, told in crew.run_tasks(double_numbers, range(20))
+        for task, told in pool.run_tasks(double_numbers, range(20))
         for item, result in zip(task, told, strict=True)
     }
     assert results == {k: -k if k in (5, 6) else 2 * k for k in range(20)}
 
 
 def test_item_on_same_worker_is_not_lost() -> None:
-    crew: TaskPool[int, int] = TaskPool(SingleWorkerExecutor(), 1, 3, (WorkerDied,), lambda number: -number)
-    results = {task[0]: told[0] for task, told in crew.run_tasks(double_numbers, range(20))}
+    pool: TaskPool[int, int] = TaskPool(SingleWorkerExecutor(), 1, 3, (WorkerDied,), lambda number: -number)
+    results = {task[0]: told[0] for task, told in pool.run_tasks(double_numbers, range(20))}
     assert results == {k: -k if k in (5, 6) else 2 * k for k in range(20)}
 
 
@@ -87,12 +87,12 @@ def test_pending_tasks_are_limited() -> None:
                 done.set_result([0] * len(args[0]))
             return done
 
-    crew: TaskPool[int, int] = TaskPool(NeverEndingExecutor(), 5, 3)
-    next(crew.run_tasks(double_numbers, count_items()))
+    pool: TaskPool[int, int] = TaskPool(NeverEndingExecutor(), 5, 3)
+    next(pool.run_tasks(double_numbers, count_items()))
     assert len(taken) == 15
 
 
 def test_other_error_ends_run() -> None:
-    crew: TaskPool[int, int] = TaskPool(ThreadExecutor(), 8, 3)
+    pool: TaskPool[int, int] = TaskPool(ThreadExecutor(), 8, 3)
     with pytest.raises(WorkerDied):
-        list(crew.run_tasks(double_numbers, range(20)))
+        list(pool.run_tasks(double_numbers, range(20)))

@@ -94,8 +94,8 @@ def test_records_reach_database_once_and_in_order(tmp_path: Path, database: Post
         "SELECT sequence, axis FROM fleet.records WHERE sequence > 0 ORDER BY stored_at, sequence"
     )
     for axis in ("X", "Y"):
-        told = [sequence for sequence, of in rows if of == axis]
-        assert told == sorted(told)
+        reported = [sequence for sequence, of in rows if of == axis]
+        assert reported == sorted(reported)
     assert sorted(sequence for sequence, _ in rows) == list(range(1, expected + 1))
     assert database.execute_query("SELECT machine, records, missing FROM fleet.machines") == [("mill_1", expected, 0)]
     ((name,),) = database.execute_query("SELECT window_name FROM fleet.windows WHERE axis = 'Y' AND number = 2")
@@ -143,8 +143,8 @@ def test_kill_at_any_point_loses_and_duplicates_nothing(tmp_path: Path, database
     for name in ("mill-1", "mill-2"):
         assert sorted(sequence for machine, sequence, _ in rows if machine == name) == list(range(1, each + 1))
         for axis in ("X", "Y"):
-            told = [sequence for machine, sequence, of in rows if (machine, of) == (name, axis)]
-            assert told == sorted(told)
+            reported = [sequence for machine, sequence, of in rows if (machine, of) == (name, axis)]
+            assert reported == sorted(reported)
     assert database.execute_query("SELECT count(*) FROM fleet.refused") == [(0,)]
 
 

@@ -27,15 +27,15 @@ Work = Callable[[Sequence[WindowReference]], list[ReanalysedWindow]]
 
 def analyse_windows(windows: Sequence[WindowReference], work: Work, count: int) -> list[ReanalysedWindow]:
     """Return the results of windows from this number of processes; a task has two windows."""
-    with open_worker_pool(None, count, per_task=2) as crew:
-        assert not count or is_closed_to_strangers(crew)
-        return stored_rapids.list_results([again for _, results in crew.run_tasks(work, windows) for again in results])
+    with open_worker_pool(None, count, per_task=2) as pool:
+        assert not count or is_closed_to_strangers(pool)
+        return stored_rapids.list_results([again for _, results in pool.run_tasks(work, windows) for again in results])
 
 
-def is_closed_to_strangers(crew: WindowCrew) -> bool:
+def is_closed_to_strangers(pool: WindowCrew) -> bool:
     """Whether all listen on this computer alone, and the scheduler rejects clients without its certificate."""
-    assert isinstance(crew.executor, DaskExecutor)
-    scheduler = crew.executor.client.cluster.scheduler.address
+    assert isinstance(pool.executor, DaskExecutor)
+    scheduler = pool.executor.client.cluster.scheduler.address
     host, port = scheduler.removeprefix("tls://").split(":")
     assert list_listening_addresses(os.getpid(), *list_children(os.getpid())) == {"127.0.0.1"}
     foreign = ssl.create_default_context()
@@ -126,9 +126,9 @@ def test_unavailable_scheduler_is_reported(tmp_path: Path) -> None:
         f"from fdhil.cli.main import main; import {open_worker_pool.__module__} as pools; pools.CONNECT_S = 2; main()"
     )
     command = [sys.executable, "-c", quick, "fleet", "reanalyse", str(tmp_path / "fleet.toml")]
-    told = subprocess.run(
+    reported = subprocess.run(
         [*command, "--scheduler", f"tcp://127.0.0.1:{find_free_port()}"], capture_output=True, text=True
     )
-    assert (told.returncode, told.stdout) == (3, "")
-    assert "does not respond" in told.stderr
-    assert len(told.stderr.splitlines()) == 1
+    assert (reported.returncode, reported.stdout) == (3, "")
+    assert "does not respond" in reported.stderr
+    assert len(reported.stderr.splitlines()) == 1

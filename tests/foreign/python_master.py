@@ -41,7 +41,7 @@ def main() -> None:
 
     network.subscribe(0x280 + node, status)
     drive.nmt.send_command(1)
-    ended, told = threading.Event(), False
+    ended, reported = threading.Event(), False
 
     def until_input_ends() -> None:
         sys.stdin.read()
@@ -55,8 +55,8 @@ def main() -> None:
             if words["status"] & mask == value:
                 words["control"] = word
         network.send_message(0x200 + node, struct.pack("<Hi", words["control"], position))
-        if not told and words["status"] & 0x6F == 0x27:
-            told = True
+        if not reported and words["status"] & 0x6F == 0x27:
+            reported = True
             print_event("enabled", statusword=words["status"], position=position)
         while not (answered.wait(period_s) or ended.is_set()):
             pass

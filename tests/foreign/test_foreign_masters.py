@@ -105,5 +105,5 @@ def test_no_request_is_sent_next_to_a_foreign_master(
         code, _, err = fdhil("commission", path, "--yes", capsys=capsys)
         assert code == 3
         assert "an NC is sending SYNC or set-points" in err
-        heard = {message.arbitration_id for message in iter(lambda: bus.recv(0), None)}
-        assert not {can_id for can_id in heard if can_id & 0x780 in (0x580, 0x600)}
+        received = {message.arbitration_id for message in iter(lambda: bus.recv(0), None)}
+        assert not {can_id for can_id in received if can_id & 0x780 in (0x580, 0x600)}

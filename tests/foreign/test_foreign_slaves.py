@@ -100,10 +100,10 @@ def assert_compared(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = fdhil("scan", machine, "--json", capsys=capsys)
     assert (code, err) == (0, "")
     (node,) = json.loads(out)["buses"][0]["nodes"]
-    said = node["answers"]
-    assert (node["node_id"], node["axis"], said["name"]) == (NODE, "X", "foreign drive")
-    assert said["identity"] == {"vendor_id": 0x1234, "product_code": 7, "revision": 1, "serial": 99}
-    assert said["eds"] == {"file": "foreign.eds", "fit": "any product"}
+    message = node["answers"]
+    assert (node["node_id"], node["axis"], message["name"]) == (NODE, "X", "foreign drive")
+    assert message["identity"] == {"vendor_id": 0x1234, "product_code": 7, "revision": 1, "serial": 99}
+    assert message["eds"] == {"file": "foreign.eds", "fit": "any product"}
     code, out, err = fdhil("check", machine, "--json", capsys=capsys)
     assert (code, err) == (1, "")
     points = {point["point"]: point for point in json.loads(out)["points"]}
@@ -165,9 +165,9 @@ def test_foreign_drive_without_the_profiles_tpdos_is_reported(
             out += source.process_frames(0)
         finally:
             source.close()
-    told = {record.code: record.text for record in out if isinstance(record, Notice)}
-    assert set(told) == {"PdoLength", "PdoMissing"}
-    assert "never sent TPDO3 (385), TPDO4 (485) though SYNC runs" in told["PdoMissing"]
+    reported = {record.code: record.text for record in out if isinstance(record, Notice)}
+    assert set(reported) == {"PdoLength", "PdoMissing"}
+    assert "never sent TPDO3 (385), TPDO4 (485) though SYNC runs" in reported["PdoMissing"]
     assert source.decoder.read_counters()["pdo_lost"] == 0
     assert sum(record.tick.size for record in out if isinstance(record, AxisSamples)) == 0
 

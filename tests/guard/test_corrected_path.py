@@ -125,8 +125,8 @@ def test_rate_is_found_from_the_first_to_the_last_segment() -> None:
     assert compute_path_rate(PATH, END - 3, _between(END - 2.0), _between(END - 1.5)) == pytest.approx(0.5)
     assert compute_path_rate(PATH, FIRST + 3, _between(FIRST + 2.0), _between(FIRST + 2.5)) == pytest.approx(0.5)
     assert compute_path_rate(PATH, 130, _between(138.5), at(139)) is None
-    beside = X[-1] // 2, Y[-1] // 2  # far along the path, and no place between its end and its begin
-    assert compute_path_rate(PATH, FIRST + 3, beside, beside) is None
+    adjacent = X[-1] // 2, Y[-1] // 2  # far along the path, and no place between its end and its begin
+    assert compute_path_rate(PATH, FIRST + 3, adjacent, adjacent) is None
 
 
 def test_rate_comes_from_the_axis_that_moves_most() -> None:

@@ -70,9 +70,9 @@ def test_each_role_may_make_its_requests() -> None:
 def test_socket_is_private_unless_users_are_named(
     daemon: int | None, watching: tuple[int, ...], mode: int, tmp_path: Path
 ) -> None:
-    desk = GuardSocketServer(tmp_path, GuardAccess(daemon, watching), lambda *_: None)
-    assert desk.path.stat().st_mode & 0o777 == mode
-    desk.close()
+    service = GuardSocketServer(tmp_path, GuardAccess(daemon, watching), lambda *_: None)
+    assert service.path.stat().st_mode & 0o777 == mode
+    service.close()
 
 
 @pytest.mark.fault("G1")

@@ -638,21 +638,21 @@ def assert_no_refusals(peer: ClientProcess, request: object) -> None:
     raise AssertionError(f"{peer} asked for {request}")
 
 
-def connected(desk: GuardSocketServer, now_s: float = 0.0) -> socket.socket:
+def connected(service: GuardSocketServer, now_s: float = 0.0) -> socket.socket:
     client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    client.connect(str(desk.path))
-    assert desk.serve_one_client({desk.fileno()}, now_s) is None
+    client.connect(str(service.path))
+    assert service.serve_one_client({service.fileno()}, now_s) is None
     return client
 
 
-def serve(desk: GuardSocketServer, now_s: float = 1.0) -> list[dict[str, Any]]:
+def serve(service: GuardSocketServer, now_s: float = 1.0) -> list[dict[str, Any]]:
     served = []
     for _ in range(50):
-        found = desk.serve_one_client({client.fileno() for client in desk.clients}, now_s)
+        found = service.serve_one_client({client.fileno() for client in service.clients}, now_s)
         if found is not None:
             served.append(found[1])
             found[0].close_unclaimed_descriptor()
-        desk.drop_gone()
+        service.drop_gone()
     return served
 
 

@@ -91,8 +91,8 @@ def format_screw_csv(moves: int = 4, seed: int = 0) -> str:
 
 
 def record_screw_axis(moves: int = 4, seed: int = 0, mechanics: Mechanics = SCREW, **sensors: Any) -> Recording:
-    run, told = simulate_screw_axis(moves, mechanics), replace(SENSORS, **sensors)
-    read = real_plant.make_recording(run, mechanics, told, RAPID_M_S, seed, voltage=False)
+    run, reported = simulate_screw_axis(moves, mechanics), replace(SENSORS, **sensors)
+    read = real_plant.make_recording(run, mechanics, reported, RAPID_M_S, seed, voltage=False)
     return replace(read, torque_constant_nm_per_a=mechanics.K)
 
 

@@ -146,10 +146,10 @@ def test_windows_without_motion_are_refused_with_a_reason(estimator_name: str) -
 def test_window_without_voltage_is_excluded(estimator_name: str) -> None:
     window = find_noisy_windows(0.001)[0]
     without = replace(window, voltage_v=None)
-    alone, beside = (_load_estimator(estimator_name)(given, SETTINGS) for given in ([without], [window, without]))
+    alone, adjacent = (_load_estimator(estimator_name)(given, SETTINGS) for given in ([without], [window, without]))
     assert alone.result is not Result.OK
     assert np.isnan(alone.values).all()
-    assert (_compute_errors_percent(beside) < CLOSER.get(estimator_name, REACH)).all()
+    assert (_compute_errors_percent(adjacent) < CLOSER.get(estimator_name, REACH)).all()
 
 
 def test_instrumental_variables_remove_the_noise_bias() -> None:

@@ -22,28 +22,28 @@ def _build_estimate(values: list[float], shares: list[float]) -> Estimate:
 
 @pytest.mark.fault("D2")
 def test_uncertain_parameter_is_null_with_a_reason() -> None:
-    told = withhold_unidentifiable(_build_estimate(list(VALUES), [0.01, 0.3, 0.01, 0.01, 0.01, 0.01]), 10.0, 157.0)
-    assert told.result is Result.UNDER_EXCITED
-    assert set(told.missing) == {"L"}
-    assert told.missing["L"].code == "LowExcitation"
-    assert "30 %" in told.missing["L"].text
-    assert np.isnan(told.get_value("L"))
-    assert told.get_value("R") == 0.5
+    reported = withhold_unidentifiable(_build_estimate(list(VALUES), [0.01, 0.3, 0.01, 0.01, 0.01, 0.01]), 10.0, 157.0)
+    assert reported.result is Result.UNDER_EXCITED
+    assert set(reported.missing) == {"L"}
+    assert reported.missing["L"].code == "LowExcitation"
+    assert "30 %" in reported.missing["L"].text
+    assert np.isnan(reported.get_value("L"))
+    assert reported.get_value("R") == 0.5
 
 
 def test_zero_viscous_friction_is_published() -> None:
-    told = withhold_unidentifiable(_build_estimate([*VALUES[:4], 0.0, 5.0], [0.01] * 6), 10.0, 157.0)
-    assert told.result is Result.OK
-    assert told.get_value("ft") == 0.0
+    reported = withhold_unidentifiable(_build_estimate([*VALUES[:4], 0.0, 5.0], [0.01] * 6), 10.0, 157.0)
+    assert reported.result is Result.OK
+    assert reported.get_value("ft") == 0.0
 
 
 @pytest.mark.parametrize("condition", [1e7, np.inf, np.nan])
 @pytest.mark.fault("D1")
 def test_rank_deficiency_publishes_nothing(condition: float) -> None:
-    told = withhold_unidentifiable(_build_estimate(list(VALUES), [0.01] * 6), condition, 157.0)
-    assert told.result is Result.ILL_CONDITIONED
-    assert np.isnan(told.values).all()
-    assert all(reason.code == "RankDeficient" for reason in told.missing.values())
+    reported = withhold_unidentifiable(_build_estimate(list(VALUES), [0.01] * 6), condition, 157.0)
+    assert reported.result is Result.ILL_CONDITIONED
+    assert np.isnan(reported.values).all()
+    assert all(reason.code == "RankDeficient" for reason in reported.missing.values())
 
 
 @pytest.mark.fault("D3")

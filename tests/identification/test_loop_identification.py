@@ -106,8 +106,8 @@ def test_configured_loops_are_confirmed() -> None:
     axis = build_bench_axis()
     loops = identify_loops_of(simulate_rapids(real.Loops()), axis)
     assert (loops.structure, loops.names) == ("p_pi_pi", GAINS)
-    for told in compare_with_configuration(axis, loops):
-        assert told.found == pytest.approx(told.configured, rel=0.01)
+    for reported in compare_with_configuration(axis, loops):
+        assert reported.found == pytest.approx(reported.configured, rel=0.01)
     assert loops.verdict.accepted
     assert loops.configured_um == pytest.approx(loops.verdict.unexplained_um, abs=0.1)
     assert not is_better_than_configured(loops)
@@ -124,15 +124,15 @@ def test_configured_loops_are_confirmed() -> None:
     ],
 )
 def test_unconfigured_loops_are_identified_within_five_percent(loops: real.Loops, configured: bool) -> None:
-    told = identify_loops_of(simulate_rapids(loops), build_bench_axis() if configured else None)
-    assert told.structure == "p_pi_pi"
-    assert ("speed_filter_s" in told.names) == (loops.speed_filter_s > 0)
-    for name, value in map_gains(told).items():
+    reported = identify_loops_of(simulate_rapids(loops), build_bench_axis() if configured else None)
+    assert reported.structure == "p_pi_pi"
+    assert ("speed_filter_s" in reported.names) == (loops.speed_filter_s > 0)
+    for name, value in map_gains(reported).items():
         assert value == pytest.approx(getattr(loops, name), rel=0.05), name
-    assert told.verdict.accepted
-    assert told.verdict.unexplained_um is not None
-    assert told.verdict.unexplained_um < 0.4  # the recording is rounded to 1 um
-    assert is_better_than_configured(told) == configured
+    assert reported.verdict.accepted
+    assert reported.verdict.unexplained_um is not None
+    assert reported.verdict.unexplained_um < 0.4  # the recording is rounded to 1 um
+    assert is_better_than_configured(reported) == configured
 
 
 @pytest.mark.usefixtures("long_computation")

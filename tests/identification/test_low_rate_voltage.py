@@ -70,9 +70,9 @@ def test_delay_longer_than_a_sample_is_refused_with_its_value(delay_s: float) ->
 def test_lost_voltage_samples_do_not_spoil_the_others() -> None:
     window = record_slow_windows(0.005)[0]
     assert window.slow_voltage is not None
-    told = np.array(window.slow_voltage.voltage_v)
-    told[60:66] = np.nan
-    holed = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=freeze_array(told)))
+    reported = np.array(window.slow_voltage.voltage_v)
+    reported[60:66] = np.nan
+    holed = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=freeze_array(reported)))
     estimate = maximum_likelihood.estimate([holed], SETTINGS)
     assert (_compute_errors_percent(estimate.values) < MEANS).all()
 

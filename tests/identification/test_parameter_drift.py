@@ -77,10 +77,10 @@ def test_disagreeing_estimates_stay_held_back() -> None:
 
 def test_alarm_has_hysteresis() -> None:
     tracker = _build_tracker()
-    told = []
+    reported = []
     for k, share in enumerate([1.1, 1.3, 1.6, 1.9, 2.1, 2.05, 1.95, 1.85, 1.7, 1.5]):
-        told += tracker.update(replace(BENCH, Cd=5.0 * share), COVARIANCE, 20 + k)
-    alarms = [notice for notice in told if notice.code == "MaintenanceDue"]
+        reported += tracker.update(replace(BENCH, Cd=5.0 * share), COVARIANCE, 20 + k)
+    alarms = [notice for notice in reported if notice.code == "MaintenanceDue"]
     assert [a.severity for a in alarms] == ["minor", "info"]
 
 
@@ -89,12 +89,12 @@ def test_change_near_its_limit_raises_one_alarm() -> None:
     limits = Maintenance(Cd=0.1)
     tracker = DriftTracker(limits, "X")
     tracker.update(BENCH, COVARIANCE)
-    told = []
+    reported = []
     for k in range(600):  # the deviation of an estimate is 1.6 %, the change varies between 9 and 13 %
         share = 1.11 + 0.02 * np.sin(k / 15)
         cd = 5.0 * share + 0.08 * rng.standard_normal()
-        told += tracker.update(replace(BENCH, Cd=cd), COVARIANCE, k)
-    assert [notice.severity for notice in told if notice.code == "MaintenanceDue"] == ["minor"]
+        reported += tracker.update(replace(BENCH, Cd=cd), COVARIANCE, k)
+    assert [notice.severity for notice in reported if notice.code == "MaintenanceDue"] == ["minor"]
 
 
 def test_alarm_is_not_repeated_after_a_restart() -> None:

@@ -28,31 +28,31 @@ def build_estimate(values: Float, covariance: Float | None = None, names: tuple[
 
 def replace_values(**values: float) -> Float:
     """Return the true values with some replaced."""
-    told = TRUE.copy()
+    reported = TRUE.copy()
     for name, value in values.items():
-        told[NAMES.index(name)] = value
-    return told
+        reported[NAMES.index(name)] = value
+    return reported
 
 
 def test_physical_estimate_is_unchanged() -> None:
-    told = build_estimate(TRUE)
-    assert bound_estimate(told) is told
-    assert bound_estimate(told, -1) is told
+    reported = build_estimate(TRUE)
+    assert bound_estimate(reported) is reported
+    assert bound_estimate(reported, -1) is reported
 
 
 def test_insignificantly_negative_breakaway_friction_becomes_zero() -> None:
-    told = build_estimate(replace_values(Cd=4.95, stribeck=-6.4))
-    assert find_unphysical_values(told) == []
-    within = bound_estimate(told)
+    reported = build_estimate(replace_values(Cd=4.95, stribeck=-6.4))
+    assert find_unphysical_values(reported) == []
+    within = bound_estimate(reported)
     assert within.get_value("Cd") + within.get_value("stribeck") == 0.0
     # both move, the more the less certain they are
     assert within.get_value("Cd") == pytest.approx(5.675)
-    assert within.covariance is told.covariance
+    assert within.covariance is reported.covariance
 
 
 def test_significantly_negative_breakaway_friction_is_refused() -> None:
-    told = build_estimate(replace_values(Cd=4.95, stribeck=-16.4))
-    (reason,) = find_unphysical_values(told)
+    reported = build_estimate(replace_values(Cd=4.95, stribeck=-16.4))
+    (reason,) = find_unphysical_values(reported)
     assert (reason.code, "Cd + stribeck = -11.45" in reason.text) == ("Unphysical", True)
 
 
@@ -85,5 +85,5 @@ def test_any_estimate_is_projected_within_all_bounds(seed: int) -> None:
     root = rng.normal(0.0, 1.0, (len(NAMES), len(NAMES))) * np.abs(TRUE)
     values = TRUE + rng.choice([0.1, 1.0, 3.0]) * root @ rng.normal(0.0, 1.0, len(NAMES))
     within = bound_estimate(build_estimate(values, root @ root.T))
-    told = dict(zip(NAMES, within.values.tolist(), strict=True))
-    assert all(bound.compute_violation(told) <= 0.0 for bound in list_bounds(NAMES))
+    reported = dict(zip(NAMES, within.values.tolist(), strict=True))
+    assert all(bound.compute_violation(reported) <= 0.0 for bound in list_bounds(NAMES))

@@ -139,8 +139,8 @@ def test_terms_are_averaged_over_their_windows_and_ripple_phase_over_the_circle(
 def test_ripple_parts_combine_to_the_original() -> None:
     names = ("Cd", "ripple_motor_4", "ripple_motor_4_phase")
     values, covariance = np.array([5.0, 0.3, -2.0]), np.diag([0.1, 0.02, 0.03]) ** 2
-    told, spread, doubts = combine_ripples(names, *split_ripples(names, values, covariance, np.ones((3, 1))))
-    assert told == pytest.approx(values)
+    reported, spread, doubts = combine_ripples(names, *split_ripples(names, values, covariance, np.ones((3, 1))))
+    assert reported == pytest.approx(values)
     assert np.allclose(spread, covariance)
     assert doubts == pytest.approx(np.ones((3, 1)))
 
@@ -161,15 +161,15 @@ def test_given_and_missing_parameters_stay_so_in_the_pool() -> None:
 
 def test_friction_sum_at_one_speed_is_more_certain_than_its_parts() -> None:
     assert FIRST is not None
-    told = replace(
+    reported = replace(
         FIRST, values=freeze_array(list(BENCH.as_dict().values())), covariance=freeze_array(build_covariance_at(RAPID))
     )
-    known = estimate_friction_at(told, RAPID)
+    known = estimate_friction_at(reported, RAPID)
     assert known is not None
     assert known[0] == pytest.approx(5.0 + 0.05 * RAPID)
     assert known[1] == pytest.approx(0.01, rel=0.01)
-    assert told.get_std("Cd") > 5 * known[1]
-    unknown = replace(told, values=freeze_array([*told.values[:4], np.nan, 5.0]))
+    assert reported.get_std("Cd") > 5 * known[1]
+    unknown = replace(reported, values=freeze_array([*reported.values[:4], np.nan, 5.0]))
     assert estimate_friction_at(unknown, RAPID) is None
 
 

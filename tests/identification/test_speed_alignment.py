@@ -39,10 +39,10 @@ TIMES = np.arange(200) * 1e-3
 )
 def test_speed_lag_is_estimated_from_the_position(sensors: Sensors, late_us: float) -> None:
     (window,) = simulate_rapids(sensors=sensors)
-    told = align_speed_to_samples(window)
-    assert told.speed_late_s is not None
-    assert 1e6 * told.speed_late_s == pytest.approx(late_us, abs=60.0)
-    assert abs(1e6 * told.speed_late_s - late_us) < 5 * 1e6 * told.speed_late_std_s
+    reported = align_speed_to_samples(window)
+    assert reported.speed_late_s is not None
+    assert 1e6 * reported.speed_late_s == pytest.approx(late_us, abs=60.0)
+    assert abs(1e6 * reported.speed_late_s - late_us) < 5 * 1e6 * reported.speed_late_std_s
 
 
 @pytest.mark.parametrize("speed", ["sensor", "middle"])
@@ -56,9 +56,9 @@ def test_aligned_speed_matches_the_shaft() -> None:
     (true,) = simulate_rapids(sensors=Sensors(noise=0.0))
     rows = np.flatnonzero(np.abs(true.speed_rad_s) > 10.0)
     shift = window.start_tick - true.start_tick
-    told = align_speed_to_samples(window).speed_rad_s[rows - shift]
+    reported = align_speed_to_samples(window).speed_rad_s[rows - shift]
     assert np.abs(window.speed_rad_s[rows - shift] - true.speed_rad_s[rows]).max() > 0.5
-    assert np.abs(told - true.speed_rad_s[rows]).max() < 0.02
+    assert np.abs(reported - true.speed_rad_s[rows]).max() < 0.02
 
 
 @pytest.mark.parametrize("estimator", [maximum_likelihood, least_squares])
@@ -84,10 +84,10 @@ def test_a_setting_says_what_the_speed_is() -> None:
     (window,) = simulate_rapids(sensors=Sensors(speed="difference"))
     assert align_speed_to_samples(window, "sensor") is window
     (steady,) = simulate_rapids()
-    told = estimate_speed_lag(steady, "difference")
-    assert told is not None
-    assert told.mean
-    assert estimate_speed_lag(steady, "filtered") is None or estimate_speed_lag(steady, "filtered") != told
+    reported = estimate_speed_lag(steady, "difference")
+    assert reported is not None
+    assert reported.mean
+    assert estimate_speed_lag(steady, "filtered") is None or estimate_speed_lag(steady, "filtered") != reported
 
 
 def test_other_speed_errors_are_not_taken_for_a_lag() -> None:
@@ -102,10 +102,10 @@ def test_other_speed_errors_are_not_taken_for_a_lag() -> None:
 def test_lost_samples_stay_lost_after_alignment() -> None:
     (window,) = simulate_rapids(sensors=Sensors(speed="difference"))
     holed = _remove_samples(window, 300, 303)
-    told = align_speed_to_samples(holed)
-    assert told.speed_late_s is not None
-    assert np.isnan(told.speed_rad_s[300:303]).all()
-    assert np.isnan(told.speed_rad_s).sum() <= 9
+    reported = align_speed_to_samples(holed)
+    assert reported.speed_late_s is not None
+    assert np.isnan(reported.speed_rad_s[300:303]).all()
+    assert np.isnan(reported.speed_rad_s).sum() <= 9
 
 
 def _remove_samples(window: Window, begin: int, end: int) -> Window:

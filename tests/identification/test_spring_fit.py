@@ -71,17 +71,19 @@ def test_configured_resonance_removes_the_bias_of_the_six() -> None:
     mechanics = replace(ORDINARY_MECHANICS, load_nm=0.0)
     windows = simulate_rapids(mechanics, ORDINARY_SENSORS, ORDINARY_LOOPS, moves=2)
     truth = np.array(list(mechanics.truth().values())) * np.array([1 / 1.01, 1 / 1.01, 1.0, 1.01, 1.01, 1.01])
-    for told, stiff in zip(
+    for reported, stiff in zip(
         analyse_rapids(windows, build_axis_with_resonance(mechanics, "bench", 125.0)),
         analyse_rapids(windows, build_axis_with_resonance(mechanics, "bench")),
         strict=True,
     ):
-        assert told.verdict.accepted
-        assert told.estimate is not None
+        assert reported.verdict.accepted
+        assert reported.estimate is not None
         assert stiff.estimate is not None
-        assert told.estimate.get_value(RESONANCE) == pytest.approx(120.0, rel=0.03)
-        assert told.estimate.get_value(SHARE) == pytest.approx(0.6, abs=0.06)
-        errors = np.array([[e.get_value(n) for n in PARAMETERS] for e in (told.estimate, stiff.estimate)]) / truth - 1.0
+        assert reported.estimate.get_value(RESONANCE) == pytest.approx(120.0, rel=0.03)
+        assert reported.estimate.get_value(SHARE) == pytest.approx(0.6, abs=0.06)
+        errors = (
+            np.array([[e.get_value(n) for n in PARAMETERS] for e in (reported.estimate, stiff.estimate)]) / truth - 1.0
+        )
         assert abs(errors[0, 3]) < 0.001  # of the inertia
         assert abs(errors[0, 1]) < min(0.003, 0.5 * abs(errors[1, 1]))  # of the inductance
 

@@ -144,9 +144,9 @@ def test_different_configured_resonance_is_warned_of(configured: float | None, c
     found = identify_compliance(simulate_table_rapid(80.0), table_m_s2=None)
     assert found is not None
     axis = bench_config("X").axis["X"].model_copy(update={"resonance_hz": configured})
-    told = check_configured_resonance(found, axis)
-    assert [reason.code for reason in told] == codes
-    assert all("60 Hz" in reason.text for reason in told)
+    reported = check_configured_resonance(found, axis)
+    assert [reason.code for reason in reported] == codes
+    assert all("60 Hz" in reason.text for reason in reported)
     assert check_configured_resonance(found, None) == []
 
 
@@ -173,9 +173,9 @@ def test_arbitrary_sensor_signals_do_not_break_the_analysis(name: str, kind: str
         "motor": window.position_mm,
         "steps": np.round(window.position_mm, 0),
     }[kind]
-    told = replace(window, table_mm=freeze_array(values) if name == "table_mm" else None)
+    reported = replace(window, table_mm=freeze_array(values) if name == "table_mm" else None)
     outcome = analyse_window(
-        replace(told, table_m_s2=freeze_array(values) if name != "table_mm" else None), Identification()
+        replace(reported, table_m_s2=freeze_array(values) if name != "table_mm" else None), Identification()
     )
     assert outcome.estimate is not None
     assert outcome.estimate.get_value("Jt") == pytest.approx(TRUE.Jt, rel=0.05)

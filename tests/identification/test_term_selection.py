@@ -56,8 +56,8 @@ def test_dead_time_of_a_commanded_voltage_is_identified_without_bias() -> None:
 
 def test_terminal_voltage_excludes_dead_time_candidates() -> None:
     (window,) = simulate_rapids(sensors=Sensors(command=True), loops=Loops(dead_time_v=2.0))
-    told = _estimate_windows(window, Identification(voltage_source="terminals"))
-    assert "dead_time" not in told.terms
+    reported = _estimate_windows(window, Identification(voltage_source="terminals"))
+    assert "dead_time" not in reported.terms
 
 
 def test_bus_sag_is_identified_per_watt() -> None:

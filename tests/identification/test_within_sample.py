@@ -91,10 +91,10 @@ def test_wrong_loops_are_not_used() -> None:
     plain = maximum_likelihood.fit_windows([window], SETTINGS)
     assert plain is not None
     other = AXIS.model_copy(update={"regulators": wrong})
-    told = maximum_likelihood.refit_with_loops(plain, window, SETTINGS, other, 0.008)
+    reported = maximum_likelihood.refit_with_loops(plain, window, SETTINGS, other, 0.008)
     right = maximum_likelihood.refit_with_loops(plain, window, SETTINGS, AXIS, 0.008)
     assert abs(right.theta[0] - 0.5) < abs(plain.theta[0] - 0.5) / 5
-    assert abs(told.theta[0] - 0.5) <= abs(plain.theta[0] - 0.5)
+    assert abs(reported.theta[0] - 0.5) <= abs(plain.theta[0] - 0.5)
 
 
 def test_short_samples_have_no_unknowns() -> None:

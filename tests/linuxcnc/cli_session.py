@@ -60,8 +60,8 @@ def record_demand(config: Path, out: Path, cut: Callable[[], None]) -> None:
         first = recording.stderr.readline()
         assert "waiting for a motion" in first, first + recording.stderr.read()
         cut()
-        told, _ = recording.communicate(timeout=PATIENCE_S)
-    assert json.loads(told)["complete"], told
+        reported, _ = recording.communicate(timeout=PATIENCE_S)
+    assert json.loads(reported)["complete"], reported
 
 
 def is_pass_repeated(status: Mapping[str, Any]) -> bool:

@@ -109,8 +109,8 @@ class HalMachine(LinuxCnc):
         config, hal = machine_config.load_config(file), write_plant_hal(base)
         splices = find_insertions(hal, {letter: joint for joint, letter in enumerate(axes)}, axes)
         text_of_hal = format_correction_hal(config, "{folder}/machine.toml", len(axes), splices, hal)
-        beside = {"fdhil.hal": text_of_hal, "machine.toml": file.read_text()}
-        super().__init__(axes=axes, base=base, hal="source fdhil.hal\n", beside=beside)
+        adjacent = {"fdhil.hal": text_of_hal, "machine.toml": file.read_text()}
+        super().__init__(axes=axes, base=base, hal="source fdhil.hal\n", beside=adjacent)
 
     def find_pids(self, program: str) -> list[int]:
         found = []

@@ -171,8 +171,8 @@ class LinuxCnc:
     def _read_answer(self) -> None:
         assert self._lines is not None
         line = self._lines.readline()
-        told: dict[str, Any] = json.loads(line) if line else {"failed": "LinuxCNC has ended"}
-        assert "done" in told, f"{told}\n{self._read_log()}"
+        reported: dict[str, Any] = json.loads(line) if line else {"failed": "LinuxCNC has ended"}
+        assert "done" in reported, f"{reported}\n{self._read_log()}"
 
     def _read_log(self) -> str:
         files = ("log", "linuxcnc_print.txt", "linuxcnc_debug.txt")
@@ -225,9 +225,9 @@ class LinuxCnc:
             asking = self._start_unprivileged(
                 "halcmd", "-s", "getp", "sampler.0.curr-depth", log=log, out=subprocess.PIPE
             )
-        told, _ = asking.communicate()
+        reported, _ = asking.communicate()
         assert asking.returncode == 0, self._read_log()
-        return int(told)
+        return int(reported)
 
     def close(self) -> None:
         """End LinuxCNC: its operator leaves, and it cleans up."""

@@ -113,11 +113,11 @@ class SourceRecorder:
 
 @asynccontextmanager
 async def listen_to_machine(config: MachineConfig) -> AsyncIterator[SourceRecorder]:
-    heard = SourceRecorder()
+    received = SourceRecorder()
     async with open_machine(config) as source:
-        running = asyncio.create_task(source.run(heard.add_record))
-        await heard.wait_until(lambda: any(isinstance(r, NcState) for r in heard.records))
-        yield heard
+        running = asyncio.create_task(source.run(received.add_record))
+        await received.wait_until(lambda: any(isinstance(r, NcState) for r in received.records))
+        yield received
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
 
@@ -135,9 +135,9 @@ def find_hal(port: int) -> str:
     return f"{TRUTH}loadusr -Wn {bridge.NAME} /usr/bin/python3 {bridge.__file__} --port {port} --channel 1\n"
 
 
-def cut_windows(heard: SourceRecorder, config: MachineConfig) -> list[WindowOutcome]:
+def cut_windows(received: SourceRecorder, config: MachineConfig) -> list[WindowOutcome]:
     pipeline = AxisPipeline("X", config)
-    records = [r for r in heard.records if not isinstance(r, NcState | Notice)]
+    records = [r for r in received.records if not isinstance(r, NcState | Notice)]
     return [o for r in records for o in pipeline.process_record(r) if isinstance(o, WindowOutcome)]
 
 
@@ -163,58 +163,60 @@ async def test_bridge_recovers_linuxcnc_sequence(tmp_path: Path) -> None:
     with SimulatorProcess(path, "--demand", "-") as twin, LinuxCnc(hal=find_hal(port)) as nc:
         config = build_config(path, twin, port)
         with record_samples(nc, tmp_path / "truth"):
-            async with listen_to_machine(config) as heard:
+            async with listen_to_machine(config) as received:
                 with nc.drive_simulator(twin):
                     await asyncio.to_thread(nc.run, PART)
-                    await heard.wait_for_rest(4)
+                    await received.wait_for_rest(4)
     truth = np.loadtxt(tmp_path / "truth")
     for axis, column in (("X", 0), ("Y", 1)):
-        require_same_sequence(heard, axis, truth[:, column], truth[:, 3].astype(int).tolist())
-    rapids = [w for w in cut_windows(heard, config) if w.window.nc is not None]
+        require_same_sequence(received, axis, truth[:, column], truth[:, 3].astype(int).tolist())
+    rapids = [w for w in cut_windows(received, config) if w.window.nc is not None]
     assert [w.window.nc and w.window.nc.line for w in rapids] == [2, 5, 7, 8]
 
 
-def require_same_sequence(heard: SourceRecorder, axis: str, demand: Float, types: Sequence[int]) -> None:
+def require_same_sequence(received: SourceRecorder, axis: str, demand: Float, types: Sequence[int]) -> None:
     """Compare with the sampler's data row by row; both begin with the first motion."""
-    ticks, bus = heard.select_axis(axis)
+    ticks, bus = received.select_axis(axis)
     offset = int(ticks[find_first_motion(bus)]) - find_first_motion(demand)
     n = min(demand.size, int(ticks[-1]) - offset)
-    told = np.full(n, MoveKind.REST, object)
-    for event in heard.list_events(axis):
-        told[max(0, event.tick - offset + 1) :] = event.kind
+    reported = np.full(n, MoveKind.REST, object)
+    for event in received.list_events(axis):
+        reported[max(0, event.tick - offset + 1) :] = event.kind
     true = np.array([KINDS[k] for k in types[:n]], object)
     moves = np.abs(np.diff(demand[:n], prepend=demand[0])) > 2e-3
     edges = np.flatnonzero(np.diff(np.array(types[:n])) != 0)
-    wrong = [k for k in np.flatnonzero(moves & (told != true)).tolist() if np.abs(edges - k).min() > 5]
-    assert wrong == [], [(k, told[k], true[k]) for k in wrong[:5]]
-    assert set(told[moves]) == {MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC}
+    wrong = [k for k in np.flatnonzero(moves & (reported != true)).tolist() if np.abs(edges - k).min() > 5]
+    assert wrong == [], [(k, reported[k], true[k]) for k in wrong[:5]]
+    assert set(reported[moves]) == {MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC}
 
 
 async def test_overrides_and_holds_are_reported_and_their_rapids_refused(tmp_path: Path) -> None:
     port, path = find_free_port(), write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
     with SimulatorProcess(path, "--demand", "-") as twin, LinuxCnc(hal=find_hal(port)) as nc:
         config = build_config(path, twin, port)
-        async with listen_to_machine(config) as heard:
+        async with listen_to_machine(config) as received:
             with nc.drive_simulator(twin):
                 for value in (0.8, 1.0):
                     await asyncio.to_thread(nc.send_order, "override", value=value)
-                    await heard.wait_until(lambda value=value: heard.state.feed_override == value)  # type: ignore[misc]
+                    await received.wait_until(lambda value=value: received.state.feed_override == value)  # type: ignore[misc]
                 for run, value in enumerate((1.0, 0.9, 1.0), 1):
-                    if value != heard.state.rapid_override:
+                    if value != received.state.rapid_override:
                         await asyncio.to_thread(nc.send_order, "rapid_override", value=value)
-                    await heard.wait_until(lambda value=value: heard.state.rapid_override == value)  # type: ignore[misc]
+                    await received.wait_until(lambda value=value: received.state.rapid_override == value)  # type: ignore[misc]
                     await asyncio.to_thread(nc.run, RAPIDS)
-                    await heard.wait_for_rest(2 * run)
+                    await received.wait_for_rest(2 * run)
                 await asyncio.to_thread(nc.start, RAPIDS)
-                await heard.wait_until(
-                    lambda: heard.state.motion is MoveKind.RAPID and heard.get_position_mm("X") > 20.0
+                await received.wait_until(
+                    lambda: received.state.motion is MoveKind.RAPID and received.get_position_mm("X") > 20.0
                 )
                 await asyncio.to_thread(nc.send_order, "pause")
-                await heard.wait_until(lambda: heard.state.motion is MoveKind.HOLD and heard.is_at_standstill(300))
+                await received.wait_until(
+                    lambda: received.state.motion is MoveKind.HOLD and received.is_at_standstill(300)
+                )
                 await asyncio.to_thread(nc.send_order, "resume")
                 await asyncio.to_thread(nc.send_order, "rest")
-                await heard.wait_for_rest(8)
-    outcomes = cut_windows(heard, config)
+                await received.wait_for_rest(8)
+    outcomes = cut_windows(received, config)
     texts = [str(o.verdict.reasons[0]) for o in outcomes if not o.verdict.accepted]
     accepted = [o.window.nc for o in outcomes if o.verdict.accepted]
     assert {nc and (nc.override, nc.held) for nc in accepted} == {((1.0, 1.0), False)}, texts

@@ -51,8 +51,8 @@ def test_correction_of_cut_matches_prediction_and_measurement(start_machine: Beg
     assert last["measured"]["rms_um"] < answer["after"]["rms_um"] + answer["after"]["uncertainty_um"]
     assert judge.check_status()["state"] == "OFF"
     assert machine.wrong == []
-    told = re.findall(r"OFF -> ARMED|Armed: armed|ARMED -> ACTIVE|PassMeasured: ", machine.log.getvalue())
-    assert told == ["OFF -> ARMED", "Armed: armed", "ARMED -> ACTIVE", "PassMeasured: "]  # as it happened
+    reported = re.findall(r"OFF -> ARMED|Armed: armed|ARMED -> ACTIVE|PassMeasured: ", machine.log.getvalue())
+    assert reported == ["OFF -> ARMED", "Armed: armed", "ARMED -> ACTIVE", "PassMeasured: "]  # as it happened
 
 
 @pytest.mark.usefixtures("long_computation")

@@ -195,6 +195,6 @@ def test_slightly_unphysical_set_is_bounded() -> None:
     models, _ = load_validated_models(make_friction_set(4.95, -6.4, covariance), CONFIG, "store")
     assert models["X"].Cd + models["X"].get_term("stribeck") == 0.0
     assert models["X"].Cd == pytest.approx(4.95 + 1.45 / (1 + 2.8**2))
-    for told in (make_friction_set(4.95, -26.4, covariance), make_friction_set(4.95, -6.4, np.zeros((6, 6)))):
+    for reported in (make_friction_set(4.95, -26.4, covariance), make_friction_set(4.95, -6.4, np.zeros((6, 6)))):
         with pytest.raises(ConfigError, match="X: Unphysical: friction in the newest set would drive"):
-            load_validated_models(told, CONFIG, "store")
+            load_validated_models(reported, CONFIG, "store")

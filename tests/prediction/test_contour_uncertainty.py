@@ -29,7 +29,7 @@ def test_contour_std_matches_sampled_plants() -> None:
     95 % of the draws are within 1.96 of it.
     """
     reference = build_bench_trajectory(10)
-    told = compute_contour_std_um(reference, MODELS, {"X": COVARIANCE, "Y": COVARIANCE}, CONFIG)
+    reported = compute_contour_std_um(reference, MODELS, {"X": COVARIANCE, "Y": COVARIANCE}, CONFIG)
     random = np.random.default_rng(5)
     drawn = []
     for _ in range(60):
@@ -39,8 +39,8 @@ def test_contour_std_matches_sampled_plants() -> None:
     scatter = np.std(drawn, axis=0)
     large = (nominal > 20) & (scatter > 0.05)
     assert large.sum() > 100
-    assert np.median(told[large] / scatter[large]) == pytest.approx(1.0, abs=0.2)
-    within = np.abs(np.array(drawn) - nominal)[:, large] <= 1.96 * told[large]
+    assert np.median(reported[large] / scatter[large]) == pytest.approx(1.0, abs=0.2)
+    within = np.abs(np.array(drawn) - nominal)[:, large] <= 1.96 * reported[large]
     assert 0.90 < within.mean() < 0.99
 
 
@@ -75,13 +75,13 @@ def test_terms_add_to_uncertainty() -> None:
     six, eight = np.zeros((6, 6)), np.zeros((8, 8))
     eight[6, 6] = 0.25
     assert compute_contour_std_um(reference, models, {"X": six, "Y": six}, CONFIG).max() == 0.0
-    told = compute_contour_std_um(reference, models, {"X": eight, "Y": eight}, CONFIG)
+    reported = compute_contour_std_um(reference, models, {"X": eight, "Y": eight}, CONFIG)
     less, more = ({axis: models[axis].replace_values(stribeck=nm) for axis in "XY"} for nm in (0.95, 1.05))
     small, large = (predict_path(reference, changed, CONFIG).error_um for changed in (less, more))
     moved = [(large[axis][600:700] - small[axis][600:700]) * 0.5 / 0.1 for axis in "XY"]
     # on the straight along X what is across the path is Y's
-    assert told[600:700] == pytest.approx(np.abs(moved[1]), rel=0.2, abs=0.02)
-    assert told.max() > 1.0
+    assert reported[600:700] == pytest.approx(np.abs(moved[1]), rel=0.2, abs=0.02)
+    assert reported.max() > 1.0
 
 
 def test_dominant_term_of_zone_is_named() -> None:

@@ -112,9 +112,9 @@ def test_tolerance_crossing_day_is_predicted() -> None:
     models = {"X": NOMINAL, "Y": NOMINAL}
     predicted = predict_path(reference, models, CONFIG)
     k = next(k for k, zone in enumerate(predicted.zones) if zone.cause == "corner")
-    zone, told = predicted.zones[k], compute_sensitivity_um(predicted, models, CONFIG)[k]
+    zone, reported = predicted.zones[k], compute_sensitivity_um(predicted, models, CONFIG)[k]
     tolerance = zone.max_um + 4.0
-    found = predict_tolerance_crossing(zone, told, models, courses, tolerance)
+    found = predict_tolerance_crossing(zone, reported, models, courses, tolerance)
     assert found is not None
     assert (found.axis, found.parameter) == ("Y", "Jt")
     assert found.earliest_days < found.days < found.latest_days
@@ -124,7 +124,7 @@ def test_tolerance_crossing_day_is_predicted() -> None:
     assert error == pytest.approx(tolerance, abs=0.5)
     # the same slope, seen for a fifth of the time that it would have to be followed at most, foresees nothing
     short = {"Y": replace(courses["Y"], span_days=0.19 * found.days)}
-    assert predict_tolerance_crossing(zone, told, models, short, tolerance) is None
+    assert predict_tolerance_crossing(zone, reported, models, short, tolerance) is None
 
 
 def select_inertia(known: ParameterTrend) -> ParameterTrend:
@@ -136,13 +136,13 @@ def test_insignificant_trend_yields_no_crossing() -> None:
     models = {"X": NOMINAL, "Y": NOMINAL}
     predicted = predict_path(reference, models, CONFIG)
     k = next(k for k, zone in enumerate(predicted.zones) if zone.cause == "corner")
-    zone, told = predicted.zones[k], compute_sensitivity_um(predicted, models, CONFIG)[k]
+    zone, reported = predicted.zones[k], compute_sensitivity_um(predicted, models, CONFIG)[k]
     days = np.arange(-9.0, 1.0)
     for rises in (np.zeros(10), -0.001 * days):
         sets = [make_parameter_set("Y", n, Jt=0.075 * (1 + rise)) for n, rise in enumerate(rises)]
         courses = {"Y": select_inertia(fit_parameter_trend(sets, days))}
-        rising = told["Y"]["Jt"] * courses["Y"].slopes["Jt"].value > 0 and rises.any()
-        assert (predict_tolerance_crossing(zone, told, models, courses, zone.max_um + 4.0) is not None) == rising
+        rising = reported["Y"]["Jt"] * courses["Y"].slopes["Jt"].value > 0 and rises.any()
+        assert (predict_tolerance_crossing(zone, reported, models, courses, zone.max_um + 4.0) is not None) == rising
 
 
 def test_trends_start_after_last_step() -> None:

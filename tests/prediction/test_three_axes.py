@@ -74,8 +74,8 @@ def test_uncertainty_includes_third_axis(three_axis_reference: Trajectory, three
         three_axis_reference, MODELS, {"X": known, "Y": known, "Z": np.diag((0.01 * values) ** 2)}, CONFIG
     )
     assert std.max() > 0.3
-    told = compute_sensitivity_um(three_axis_correction.before, MODELS, CONFIG)
-    assert max(abs(per_axis["Z"]["Jt"]) for per_axis in told) > 0.2
+    reported = compute_sensitivity_um(three_axis_correction.before, MODELS, CONFIG)
+    assert max(abs(per_axis["Z"]["Jt"]) for per_axis in reported) > 0.2
 
 
 def test_prediction_is_invariant_to_axis_order(three_axis_reference: Trajectory) -> None:

@@ -148,8 +148,8 @@ def run_reference(program: Path, limit_s: float = 20.0, ini: str = "") -> Refere
         if match is not None:
             canon.call(match[1], match[2])
     lines = done.stderr.decode("latin-1").strip().splitlines()
-    told = [line for line in lines if line.strip() and not line.startswith("executing")]
-    return ReferenceAnswer(canon.motions, "\n".join(told) if done.returncode else "")
+    reported = [line for line in lines if line.strip() and not line.startswith("executing")]
+    return ReferenceAnswer(canon.motions, "\n".join(reported) if done.returncode else "")
 
 
 def read_cases() -> list[tuple[str, str]]:

@@ -112,6 +112,6 @@ def test_a_demand_beyond_32_bits_is_refused_with_its_line(sign: int, tmp_path: P
 
 def test_advice_of_message_resolves_error() -> None:
     reach = PositionRange.build_for_axis("X", build_fine_config().axis["X"], 0.001)
-    told = re.search(r"is (\S+) mm;", reach.describe_fault(1e6))
-    assert told is not None
-    assert reach.can_reach(float(told[1]))
+    reported = re.search(r"is (\S+) mm;", reach.describe_fault(1e6))
+    assert reported is not None
+    assert reach.can_reach(float(reported[1]))

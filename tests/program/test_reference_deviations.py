@@ -54,9 +54,9 @@ def test_machine_matches_fdhil_where_rs274_deviates(text: str, why: str) -> None
 @pytest.mark.parametrize(("text", "why"), [m for m in MARKED if "their feed" in m[1]])
 def test_machine_runs_spline_at_previous_feed(text: str, why: str) -> None:
     text = text.replace("F100", "F1000")
-    said = {motion.feed for motion in interpret(text.splitlines()) if isinstance(motion, Feed)}
+    message = {motion.feed for motion in interpret(text.splitlines()) if isinstance(motion, Feed)}
     steps = np.linalg.norm(np.diff(record_demand("G61\n" + text), axis=0), axis=1) * 60_000.0
-    assert list(said) == pytest.approx([float(np.median(steps[len(steps) // 2 :]))], rel=0.01)
+    assert list(message) == pytest.approx([float(np.median(steps[len(steps) // 2 :]))], rel=0.01)
 
 
 @pytest.mark.parametrize(("text", "why"), [m for m in MARKED if m[1].startswith("written out")])

@@ -75,8 +75,8 @@ def test_generated_programs_match_reference(group: str, tmp_path: Path) -> None:
         except subprocess.SubprocessError:  # some contours block the reference forever, or crash it; fdhil answers
             interpret_file(path)
             continue
-        told = compare_with_reference(*interpret_file(path), reference, tolerance_mm)
-        assert not told or (group, seed) in CUSPS, f"{group} {seed}: {told}\n{text}"
+        reported = compare_with_reference(*interpret_file(path), reference, tolerance_mm)
+        assert not reported or (group, seed) in CUSPS, f"{group} {seed}: {reported}\n{text}"
 
 
 def test_package_examples_match_reference() -> None:
@@ -86,9 +86,9 @@ def test_package_examples_match_reference() -> None:
         reference = run_reference(path)
         if "no percent sign or program end" in reference.error:  # for fdhil the end of the file ends the program
             reference.error = ""
-        told = compare_with_reference(*interpret_file(path), reference, ROUNDING_INCH_MM)
-        if told and "no tool table" not in told:
-            differing[path.name] = told
+        reported = compare_with_reference(*interpret_file(path), reference, ROUNDING_INCH_MM)
+        if reported and "no tool table" not in reported:
+            differing[path.name] = reported
         else:
             agreed += 1
     assert not differing, f"{agreed} agree"
@@ -99,8 +99,8 @@ def test_written_programs_match_reference(tmp_path: Path) -> None:
     for text, why in read_cases():
         path.write_text(text)
         tolerance_mm = ROUNDING_INCH_MM if "G20" in text else ROUNDING_MM
-        told = compare_with_reference(*interpret_file(path), run_reference(path), tolerance_mm)
-        assert bool(told) == bool(why), f"{told or 'agrees, though it should not: ' + why}\n{text}"
+        reported = compare_with_reference(*interpret_file(path), run_reference(path), tolerance_mm)
+        assert bool(reported) == bool(why), f"{reported or 'agrees, though it should not: ' + why}\n{text}"
 
 
 REFUSED = [

@@ -234,9 +234,9 @@ async def test_client_receives_each_change_against_the_last_reported_value(
         assert must_report(before, now, ua.DataChangeFilter(trigger, BAND.Percent, 50.0)) is expected
 
 
-async def subscribed(client: Client, heard: ReceivedEvents, at: str = "messages") -> Any:
+async def subscribed(client: Client, received: ReceivedEvents, at: str = "messages") -> Any:
     tool = await client.get_namespace_index(MACHINE_TOOL)
-    subscription = await client.create_subscription(20, heard)
+    subscription = await client.create_subscription(20, received)
     types = [client.get_node(f"ns={tool};i=39"), client.get_node(f"ns={tool};i=35")]
     node = client.nodes.server if at == "server" else await own(client, at)
     await subscription.subscribe_events(node, types)
@@ -388,8 +388,8 @@ async def test_client_is_authenticated_by_certificate_and_password(
         plain.set_user("scada")
         plain.set_password(PASSWORD)
         assert await refused(plain.connect()) != "let in"
-    said = capfd.readouterr()
-    assert PASSWORD not in said.out + said.err
+    message = capfd.readouterr()
+    assert PASSWORD not in message.out + message.err
     assert addresses == {"127.0.0.1"}  # by which wrong passwords are counted
 
 

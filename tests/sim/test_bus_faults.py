@@ -36,11 +36,11 @@ def build_message(can_id: int, data: bytes = b"") -> can.Message:
 
 
 def receive_until(party: can.BusABC, can_id: int, data: bytes | None = None) -> list[can.Message]:
-    heard: list[can.Message] = []
+    received: list[can.Message] = []
     for each in party:
-        heard.append(each)
+        received.append(each)
         if each.arbitration_id == can_id and data in (None, bytes(each.data)):
-            return heard
+            return received
     raise AssertionError
 
 
@@ -59,8 +59,8 @@ def test_machine_frames_are_dropped_delayed_and_injected_for_all_clients(bench: 
     bench.fault("bus_inject", None, can_id=0x81, data="1032", value=3)
     bench.fault("bus_delay", None, can_id=0x201, value=1, way="sent")
     for party in buses:
-        heard = record_cycles(bench, party, 8)
-        for cycle in heard[2:]:
+        received = record_cycles(bench, party, 8)
+        for cycle in received[2:]:
             assert 0x181 not in cycle
             assert 0x281 in cycle
             assert cycle.count(0x81) == 3
@@ -79,9 +79,9 @@ def test_client_frames_are_corrupted_for_drives_and_other_clients(
     together = [build_message(can_id, b"\1\2") for can_id in (STRANGER, STRANGER + 1, STRANGER + 2)]
     line: Any = sender
     line._tcp_send("".join(map(socketcand.convert_can_message_to_ascii_message, together)))
-    heard = receive_until(other, STRANGER + 1)
-    told = [(each.arbitration_id, bytes(each.data)) for each in heard if each.arbitration_id < 0x700]
-    assert told == [(STRANGER, b"\1"), (STRANGER + 2, b"\1\2"), (STRANGER + 1, b"\1\2")]
+    received = receive_until(other, STRANGER + 1)
+    reported = [(each.arbitration_id, bytes(each.data)) for each in received if each.arbitration_id < 0x700]
+    assert reported == [(STRANGER, b"\1"), (STRANGER + 2, b"\1\2"), (STRANGER + 1, b"\1\2")]
     sender.send(build_message(0x601, bytes.fromhex("40 00 10 00 00 00 00 00")))
     assert not [each for each in receive_until(sender, 0x581) if STRANGER <= each.arbitration_id <= STRANGER + 2]
 
@@ -139,9 +139,9 @@ def test_script_and_plan_in_documentation_are_valid(tmp_path: Path) -> None:
     entries = fault_script.load_script(tmp_path / "faults.toml", ("X", "Y"))
     assert [entry.fault for entry in entries] == ["bus_drop", "bus_delay", "sensor_flipped"]
     (program,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    told: list[str] = []
-    exec(program, {"print": lambda *words: told.append(" ".join(map(str, words)))})
-    assert told == ["0 frames were lost by plan"]
+    reported: list[str] = []
+    exec(program, {"print": lambda *words: reported.append(" ".join(map(str, words)))})
+    assert reported == ["0 frames were lost by plan"]
 
 
 def test_faults_of_one_connection_do_not_affect_other_clients(bench: FeedDriveBench) -> None:

@@ -310,9 +310,9 @@ def test_kernel_remote_frames_have_no_data() -> None:
         attached._socket = ours
         for can_id, length in ((0x701 | 1 << 30, 1), (0x123 | 1 << 29, 8), (0x601, 2)):
             theirs.send(struct.pack("=IB3x8s", can_id, length, b"\x05\x06" + bytes(6)))
-        heard: list[tuple[int, bytes]] = []
-        attached.receive_frames([ours], heard.append)
-        assert heard == [(0x701, b""), (0x601, b"\x05\x06")]  # the second was an error frame
+        received: list[tuple[int, bytes]] = []
+        attached.receive_frames([ours], received.append)
+        assert received == [(0x701, b""), (0x601, b"\x05\x06")]  # the second was an error frame
 
 
 def test_only_heartbeats_are_sent_in_nmt_stopped() -> None:
@@ -340,11 +340,11 @@ def test_emergencies_respect_inhibit_time() -> None:
     rig.drive.run_timers(1.0)
     for code in (0x2310, 0x3210, 0x4310):
         rig.drive.trip_fault(code)
-    told = {}
+    reported = {}
     for n in range(100):
         now = 1.0 + n * 0.005
-        told.update(dict.fromkeys(list_emergency_codes(rig.drive.run_timers(now)), round(now, 3)))
-    assert told == {0x2310: 1.0, 0x3210: pytest.approx(1.1, abs=0.006), 0x4310: pytest.approx(1.2, abs=0.006)}
+        reported.update(dict.fromkeys(list_emergency_codes(rig.drive.run_timers(now)), round(now, 3)))
+    assert reported == {0x2310: 1.0, 0x3210: pytest.approx(1.1, abs=0.006), 0x4310: pytest.approx(1.2, abs=0.006)}
 
 
 @pytest.mark.parametrize(("behaviour", "state"), [(0, 0x7F), (1, 0x05), (2, 0x04)])

@@ -144,15 +144,15 @@ def test_jam_without_sync_sends_emergency() -> None:
 @pytest.mark.parametrize("mean_s", [0.9 * MS, 1 * MS, 1.1 * MS, 1.4 * MS, 3 * MS])
 def test_irregular_sync_does_not_change_drive_speed(mean_s: float) -> None:
     clock, rng = DriveOscillator(MS), np.random.default_rng(3)
-    next_sync = told = 0.0
+    next_sync = reported = 0.0
     cycles = 0
-    while told < 20.0:
-        if next_sync <= told:
+    while reported < 20.0:
+        if next_sync <= reported:
             cycles += clock.accept_sync()
             next_sync += mean_s * rng.exponential()
         else:
-            cycles += clock.count_due_cycles(told, bound=False)
-            told += MS if clock.leads else 4 * MS
+            cycles += clock.count_due_cycles(reported, bound=False)
+            reported += MS if clock.leads else 4 * MS
     assert cycles == pytest.approx(20_000, rel=0.015)
 
 

@@ -105,14 +105,14 @@ def test_corrupted_content_fits_can_frame() -> None:
 def test_same_seed_affects_same_frames_regardless_of_other_direction(seed: int, ways: list[Way]) -> None:
     plan = [apply_plan("drop", percent=40), apply_plan("mutate", 5, percent=30)]
     both, one = FrameFaults(plan, seed), FrameFaults(plan, seed)
-    heard = [
+    received = [
         out
         for k, way in enumerate(ways)
         for out in both.process_frame((0x181, bytes([k])), way, 0.0)
         if way == "received"
     ]
     mine = [k for k, way in enumerate(ways) if way == "received"]
-    assert heard == [out for k in mine for out in one.process_frame((0x181, bytes([k])), "received", 0.0)]
+    assert received == [out for k in mine for out in one.process_frame((0x181, bytes([k])), "received", 0.0)]
 
 
 def test_percentage_of_affected_frames_matches_plan() -> None:

@@ -68,9 +68,9 @@ def test_profile_position_homing_velocity_and_quick_stop_without_sync(tmp_path: 
 
 
 def test_node_guarding_and_emergency_work_without_sync(tmp_path: Path) -> None:
-    told = threading.Event()
+    reported = threading.Event()
     with start_master(tmp_path) as node:
-        node.emcy.add_callback(lambda _: told.set())
+        node.emcy.add_callback(lambda _: reported.set())
         node.nmt.start_node_guarding(0.02)
         node.sdo[0x100C].raw = 60_000
         node.sdo[0x6065].raw = 1  # any motion is too much
@@ -79,7 +79,7 @@ def test_node_guarding_and_emergency_work_without_sync(tmp_path: Path) -> None:
         node.sdo[0x6060].raw = 1
         node.sdo[0x607A].raw = 65536
         node.sdo[0x6040].raw = 0x1F
-        assert told.wait(60)
+        assert reported.wait(60)
         node.nmt.stop_node_guarding()
         assert node.emcy.active[0].code == 0x8611
         assert node.nmt.wait_for_heartbeat(60) == "OPERATIONAL"

@@ -70,16 +70,16 @@ def test_malformed_frames_are_refused(text: str) -> None:
 
 
 def test_client_receives_frames_of_others_but_not_its_own() -> None:
-    heard = []
+    received = []
     hub = TcpHub("can0")
-    with run_hub(hub, lambda hub, frame: heard.append(frame)), join_clients(hub, 3) as (a, b, c):
+    with run_hub(hub, lambda hub, frame: received.append(frame)), join_clients(hub, 3) as (a, b, c):
         a.send(can.Message(arbitration_id=0x181, data=b"\x0a\xff", is_extended_id=False))
         b.send(can.Message(arbitration_id=0x000, data=b"\x01\x00", is_extended_id=False))
         assert receive_frames(c, 2) == [(0x181, b"\x0a\xff"), (0x000, b"\x01\x00")]
         assert receive_frames(a, 1) == [(0x000, b"\x01\x00")]
         assert receive_frames(b, 1) == [(0x181, b"\x0a\xff")]
         assert a.recv(0.05) is None
-    assert heard == [(0x181, b"\x0a\xff"), (0x000, b"\x01\x00")]
+    assert received == [(0x181, b"\x0a\xff"), (0x000, b"\x01\x00")]
 
 
 def test_simulator_answers_in_order_of_frames() -> None:

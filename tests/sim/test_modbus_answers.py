@@ -81,10 +81,10 @@ def test_same_seed_corrupts_same_share_of_answers() -> None:
 
 def test_torn_number_mixes_words_of_two_instants() -> None:
     registers, faults = CountingRegisters(), SensorFaults(answers={"torn": 100.0})
-    told = [
+    reported = [
         apply_answer_faults(faults, lambda _unit, data: data, 1, build_body(registers, faults))[0] for _ in range(4)
     ]
-    numbers = [int.from_bytes(data[2:], "big") for data in told]
+    numbers = [int.from_bytes(data[2:], "big") for data in reported]
     assert numbers == [0x1FFF7, 0x1FFFE, 0x10005, 0x2000C]  # the high word of the answer before, the low one of now
 
 

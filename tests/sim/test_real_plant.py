@@ -241,12 +241,12 @@ def test_dc_link_sags_with_power() -> None:
 
 def test_encoder_difference_speed_is_delayed_and_quantised() -> None:
     machine = build_axis(encoder_bits=13, speed_object="difference")
-    told, true = [], []
+    reported, true = [], []
     for points in list_points(build_reversal()):
         machine.run_cycle(True, build_command(points))
-        told.append(machine.sensed.speed_rad_s)
+        reported.append(machine.sensed.speed_rad_s)
         true.append(machine.speed_rad_s)
-    speed, shown = np.array(true), np.array(told)
+    speed, shown = np.array(true), np.array(reported)
     quantum = 2 * np.pi / 2**13 / 1e-3
     assert np.abs(shown / quantum - np.rint(shown / quantum)).max() < 1e-6
     middle = (speed[:-1] + speed[1:]) / 2
@@ -258,13 +258,13 @@ def test_encoder_difference_speed_is_delayed_and_quantised() -> None:
 
 def test_filtered_speed_object_lags_by_time_constant() -> None:
     machine = build_axis(speed_object_filter_s=5e-3)
-    told, true = [], []
+    reported, true = [], []
     for points in list_points(build_reversal()[:200]):
         machine.run_cycle(True, build_command(points))
-        told.append(machine.sensed.speed_rad_s)
+        reported.append(machine.sensed.speed_rad_s)
         true.append(machine.speed_rad_s)
     rate = np.gradient(true, 1e-3)
-    late_s = (np.array(true) - told)[50:100] @ rate[50:100] / (rate[50:100] @ rate[50:100])
+    late_s = (np.array(true) - reported)[50:100] @ rate[50:100] / (rate[50:100] @ rate[50:100])
     assert late_s == pytest.approx(5e-3, abs=0.5e-3)
 
 

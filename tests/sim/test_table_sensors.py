@@ -93,8 +93,8 @@ def test_table_sensors_measure_table_not_motor(tmp_path: Path) -> None:
     assert sent[-1] == pytest.approx(drive.table_mm, abs=2e-5)
     lines = hand.machine.tables.accelerometers["X"].take_lines().decode().splitlines()
     pushed = np.array([float(line.split(",")[1]) for line in lines]) * 1e-3 - TILT_M_S2
-    told = np.gradient(np.gradient(np.array(sent), 1e-3), 1e-3) * 1e-3
-    assert np.abs(pushed).max() == pytest.approx(np.abs(told).max(), rel=0.15)
+    reported = np.gradient(np.gradient(np.array(sent), 1e-3), 1e-3) * 1e-3
+    assert np.abs(pushed).max() == pytest.approx(np.abs(reported).max(), rel=0.15)
     assert np.abs(pushed).max() > 2.0
 
 
@@ -112,10 +112,10 @@ def test_stream_device_is_removed_with_simulator(tmp_path: Path) -> None:
     port = StreamPort("accelerometer X", str(device))
     reader = os.open(device, os.O_RDONLY | os.O_NOCTTY)
     port.send_lines(b"1,2\n3,4\n")
-    heard = b""
-    while len(heard) < 8:  # a terminal hands over what has come, in as many parts as it likes
-        heard += os.read(reader, 100)
-    assert heard == b"1,2\n3,4\n"
+    received = b""
+    while len(received) < 8:  # a terminal hands over what has come, in as many parts as it likes
+        received += os.read(reader, 100)
+    assert received == b"1,2\n3,4\n"
     port.send_lines(b"x" * 60 + b"\n")
     os.close(reader)
     for _ in range(200):  # without a reader, excess data is lost

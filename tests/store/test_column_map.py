@@ -75,10 +75,10 @@ def _make_columns() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("case", CASES)
 def test_vendor_text_file_becomes_a_recording(case: str, tmp_path: Path) -> None:
     write, time = CASES[case]
-    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace, reported = tmp_path / "trace.csv", tmp_path / "map.toml"
     trace.write_bytes(write(_make_columns()))
-    told.write_text(HEADERS + MAP % time)
-    read = read_recording(trace, read_column_map(told))
+    reported.write_text(HEADERS + MAP % time)
+    read = read_recording(trace, read_column_map(reported))
     assert (read.axis, read.dt_s, read.voltage_v, read.torque_constant_nm_per_a) == ("X", 0.001, None, 0.3)
     np.testing.assert_allclose(read.current_a, CURRENT, rtol=1e-7)
     np.testing.assert_allclose(read.speed_rad_s, SPEED, rtol=1e-7, atol=1e-9)
@@ -86,21 +86,23 @@ def test_vendor_text_file_becomes_a_recording(case: str, tmp_path: Path) -> None
 
 
 def test_missing_speed_is_difference_of_positions(tmp_path: Path) -> None:
-    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace, reported = tmp_path / "trace.csv", tmp_path / "map.toml"
     trace.write_bytes(_make_semicolon_trace(_make_columns()))
-    told.write_text(
+    reported.write_text(
         HEADERS + MAP.replace('speed_rad_per_s = { name = "Drehzahl", unit = "rpm" }\n', "") % CASES["semicolon"][1]
     )
-    read = read_recording(trace, read_column_map(told))
+    read = read_recording(trace, read_column_map(reported))
     assert read.headers["speed_source"] == "difference"
     np.testing.assert_allclose(read.speed_rad_s[1:], SPEED[1:], rtol=1e-5, atol=1e-4)
 
 
 def test_table_speed_needs_only_the_pitch(tmp_path: Path) -> None:
-    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace, reported = tmp_path / "trace.csv", tmp_path / "map.toml"
     trace.write_bytes(_make_semicolon_trace(_make_columns() | {"Drehzahl": SPEED * PITCH_M / (2 * math.pi) * 60e3}))
-    told.write_text(HEADERS + MAP.replace('"rpm"', '"mm/min"') % CASES["semicolon"][1])
-    np.testing.assert_allclose(read_recording(trace, read_column_map(told)).speed_rad_s, SPEED, rtol=1e-7, atol=1e-9)
+    reported.write_text(HEADERS + MAP.replace('"rpm"', '"mm/min"') % CASES["semicolon"][1])
+    np.testing.assert_allclose(
+        read_recording(trace, read_column_map(reported)).speed_rad_s, SPEED, rtol=1e-7, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,10 +116,10 @@ def test_table_speed_needs_only_the_pitch(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_map_is_refused_with_its_key(old: str, new: str, words: str, tmp_path: Path) -> None:
-    told = tmp_path / "map.toml"
-    told.write_text((HEADERS + MAP % CASES["twincat"][1]).replace(old, new))
+    reported = tmp_path / "map.toml"
+    reported.write_text((HEADERS + MAP % CASES["twincat"][1]).replace(old, new))
     with pytest.raises(ConfigError, match=words):
-        read_column_map(told)
+        read_column_map(reported)
 
 
 @pytest.mark.parametrize(
@@ -132,11 +134,11 @@ def test_invalid_map_is_refused_with_its_key(old: str, new: str, words: str, tmp
     ],
 )
 def test_trace_that_contradicts_the_map_is_refused_in_one_sentence(content: bytes, words: str, tmp_path: Path) -> None:
-    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace, reported = tmp_path / "trace.csv", tmp_path / "map.toml"
     trace.write_bytes(content)
-    told.write_text(HEADERS + MAP % CASES["quoted"][1])
+    reported.write_text(HEADERS + MAP % CASES["quoted"][1])
     with pytest.raises(RecordingError, match=words):
-        read_recording(trace, read_column_map(told))
+        read_recording(trace, read_column_map(reported))
 
 
 @pytest.mark.parametrize(
@@ -157,17 +159,17 @@ def test_trace_that_contradicts_the_map_is_refused_in_one_sentence(content: byte
 def test_unit_that_contradicts_the_file_is_refused(
     units: str, name: str, old: str, new: str, words: str, tmp_path: Path
 ) -> None:
-    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace, reported = tmp_path / "trace.csv", tmp_path / "map.toml"
     text = (
         _make_semicolon_trace(_make_columns()).decode("utf-16").replace("ms;[];[];[];[]", units).replace("Strom", name)
     )
     trace.write_bytes(text.encode())
-    told.write_text((HEADERS + MAP % CASES["semicolon"][1]).replace(old, new))
+    reported.write_text((HEADERS + MAP % CASES["semicolon"][1]).replace(old, new))
     if not words:
-        assert read_recording(trace, read_column_map(told)).current_a.size == N
+        assert read_recording(trace, read_column_map(reported)).current_a.size == N
         return
     with pytest.raises(RecordingError, match=words):
-        read_recording(trace, read_column_map(told))
+        read_recording(trace, read_column_map(reported))
 
 
 @pytest.mark.parametrize(
@@ -179,10 +181,10 @@ def test_unit_that_contradicts_the_file_is_refused(
     ],
 )
 def test_times_that_do_not_rise_are_refused(time_ms: Callable[[int], int], words: str, tmp_path: Path) -> None:
-    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace, reported = tmp_path / "trace.csv", tmp_path / "map.toml"
     head, rows = _make_semicolon_trace(_make_columns()).decode("utf-16").split("[]\r\n", 1)
     cells = [row.partition(";")[2] for row in rows.splitlines()]
     trace.write_text("\n".join([f"{head}[]", *(f"{time_ms(k)};{row}" for k, row in enumerate(cells)), ""]))
-    told.write_text(HEADERS + MAP % CASES["semicolon"][1])
+    reported.write_text(HEADERS + MAP % CASES["semicolon"][1])
     with pytest.raises(RecordingError, match=words):
-        read_recording(trace, read_column_map(told))
+        read_recording(trace, read_column_map(reported))

@@ -88,9 +88,9 @@ def test_flipped_bit_of_a_history_never_changes_records(tmp_path: Path) -> None:
         flipped = bytearray(whole)
         flipped[byte] ^= 1 << bit
         (damaged / HISTORY_FILE_NAME).write_bytes(flipped)
-        told: list[str] = []
+        reported: list[str] = []
         try:
-            with History.open_read_only(damaged, told.append) as history:
+            with History.open_read_only(damaged, reported.append) as history:
                 found = read_contents(history)
                 missing = {key for key in history._damaged if key[0] in TABLES}
         except StoreError as error:
@@ -100,8 +100,8 @@ def test_flipped_bit_of_a_history_never_changes_records(tmp_path: Path) -> None:
             rest = [row for row in true[table] if row in found[table]]
             assert found[table] == rest, (byte, bit, table)
             assert len(true[table]) - len(rest) == sum(name == table for name, _ in missing), (byte, bit, table)
-        left_out += len(told)
-        assert len(told) == (len(missing) > 0)
+        left_out += len(reported)
+        assert len(reported) == (len(missing) > 0)
     assert len(refused) > 50
     assert all("start the daemon" in str(e) or e.code in ("SchemaVersion", "StoreFault") for e in refused)
     assert left_out > 100
@@ -161,9 +161,9 @@ def test_damaged_revision_is_reported_and_previous_one_used(tmp_path: Path) -> N
     db.execute("UPDATE revisions SET K = 0.9 WHERE axis = 'X' AND revision = 8")
     db.commit()
     db.close()
-    told: list[str] = []
-    assert read_newest_parameters(tmp_path, "X", told.append)["X"].set.parameters.R == 0.5 + 6
-    (sentence,) = told
+    reported: list[str] = []
+    assert read_newest_parameters(tmp_path, "X", reported.append)["X"].set.parameters.R == 0.5 + 6
+    (sentence,) = reported
     assert "1 of revisions (row 15) damaged and left out" in sentence
     with History.open(tmp_path) as history:
         assert history.quarantine_damaged_rows() == "1 of revisions (row 15)"
@@ -183,9 +183,9 @@ def test_unreadable_row_of_older_schema_is_left_out(tmp_path: Path) -> None:
     db.execute(f"INSERT INTO revisions VALUES ({', '.join('?' * len(row))})", row)
     db.commit()
     db.close()
-    told: list[str] = []
-    assert read_newest_parameters(tmp_path, "X", told.append) == {}
-    assert len(told) == 1
+    reported: list[str] = []
+    assert read_newest_parameters(tmp_path, "X", reported.append) == {}
+    assert len(reported) == 1
     with History.open(tmp_path) as history:
         assert history.quarantine_damaged_rows() == "1 of revisions (row 1)"
 

@@ -19,10 +19,10 @@ STEPS = 14  # the folder: open and fsync of the one above; each window: open, wr
 
 
 def write_until_killed(folder: Path, nth: int) -> tuple[int, bool]:
-    told, tell = os.pipe()
+    reported, tell = os.pipe()
     child = os.fork()
     if child == 0:
-        os.close(told)
+        os.close(reported)
         _kill_at_step(nth)
         store = WindowStore(folder, keep=5, config_digest="d")
         for seed in (1, 2):
@@ -30,7 +30,7 @@ def write_until_killed(folder: Path, nth: int) -> tuple[int, bool]:
             _write(tell, b"k")
         os._exit(0)
     os.close(tell)
-    with os.fdopen(told, "rb") as acknowledged:
+    with os.fdopen(reported, "rb") as acknowledged:
         count = len(acknowledged.read())
     _, status = os.waitpid(child, 0)
     return count, os.WIFSIGNALED(status)

@@ -79,10 +79,10 @@ def test_old_damaged_row_is_left_out_when_read(tmp_path: Path) -> None:
         db.execute("UPDATE revisions SET K = 9.0 WHERE axis = 'Y' AND revision = 4")
         db.execute("UPDATE windows SET axis = 'Q' WHERE id = ?", (ROWS,))  # the very value that is compared
     db.close()
-    told: list[str] = []
-    with History.open_read_only(tmp_path, told.append) as history:
+    reported: list[str] = []
+    with History.open_read_only(tmp_path, reported.append) as history:
         assert [found.set.revision for found in history.read_revisions("Y", limit=2)] == [3]
         assert len(history.read_windows("X", limit=2)) == 2
-    assert told
-    assert "1 of windows (row 60)" in told[0]
-    assert "1 of revisions (row 5)" in told[0]
+    assert reported
+    assert "1 of windows (row 60)" in reported[0]
+    assert "1 of revisions (row 5)" in reported[0]

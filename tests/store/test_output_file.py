@@ -77,8 +77,8 @@ def test_standard_output_is_appended_to(name: str, tmp_path: Path) -> None:
     )
     with (tmp_path / "answer.txt").open("w") as answer:
         subprocess.run([sys.executable, "-c", code, name], stdout=answer, cwd=tmp_path, check=True)
-    told = (tmp_path / "answer.txt").read_text().split()
-    assert told == ["before", "written", "after"] if name != "/dev/null" else ["before", "after"]
+    reported = (tmp_path / "answer.txt").read_text().split()
+    assert reported == ["before", "written", "after"] if name != "/dev/null" else ["before", "after"]
     assert [path.name for path in tmp_path.iterdir()] == ["answer.txt"]
 
 

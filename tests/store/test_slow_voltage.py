@@ -41,11 +41,11 @@ def test_changed_grid_is_detected_as_damage() -> None:
 
 def test_document_without_voltage_has_units() -> None:
     outcome = analyse_window(replace(record_slow_windows(0.005)[0], slow_voltage=None), Identification())
-    told = build_outcome_document(outcome)["parameters"]
-    assert told["Jt/K"]["value"] == pytest.approx(0.075 / 0.8, rel=0.01)
-    assert [told[name]["unit"] for name in ("Jt/K", "ft/K", "Cd/K")] == ["A.s2/rad", "A.s/rad", "A"]
-    assert told["L"]["value"] is None
-    assert "there is no voltage" in told["L"]["reason"]
+    reported = build_outcome_document(outcome)["parameters"]
+    assert reported["Jt/K"]["value"] == pytest.approx(0.075 / 0.8, rel=0.01)
+    assert [reported[name]["unit"] for name in ("Jt/K", "ft/K", "Cd/K")] == ["A.s2/rad", "A.s/rad", "A"]
+    assert reported["L"]["value"] is None
+    assert "there is no voltage" in reported["L"]["reason"]
 
 
 def _make_lines(window: Window) -> list[str]:
@@ -67,10 +67,10 @@ def test_sample_delays_of_a_meter_are_stored() -> None:
     assert back is not None
     assert back.late_s is not None
     np.testing.assert_array_equal(back.late_s, window.slow_voltage.late_s)
-    told = parse_recording(encode(convert_window(window)).decode()).slow_voltage
-    assert told is not None
-    assert told.late_s is not None
-    np.testing.assert_array_equal(told.late_s, window.slow_voltage.late_s)
+    reported = parse_recording(encode(convert_window(window)).decode()).slow_voltage
+    assert reported is not None
+    assert reported.late_s is not None
+    np.testing.assert_array_equal(reported.late_s, window.slow_voltage.late_s)
 
 
 @pytest.mark.parametrize("late", ["0.001", "nonsense", "0.009 " * 500])

@@ -68,8 +68,10 @@ READ = [
 
 
 def _read_trace(dialect: Dialect) -> RecordingTable:
-    told = ColumnMap.model_validate(make_column_map(dialect))
-    return apply_column_map(parse_trace(write_trace(dialect, make_signals()), told.text, "trace"), told, "trace")
+    reported = ColumnMap.model_validate(make_column_map(dialect))
+    return apply_column_map(
+        parse_trace(write_trace(dialect, make_signals()), reported.text, "trace"), reported, "trace"
+    )
 
 
 def _assert_equal(read: RecordingTable, dialect: Dialect) -> None:

@@ -63,9 +63,9 @@ def _record_live_rapid(rates: Array) -> list[Record]:
 
 def _collect_outcomes(folder: Path, rates: Array) -> tuple[list[WindowOutcome], bool]:
     pipeline = AxisPipeline("X", config_of(folder))
-    told = [outcome for record in _record_live_rapid(rates) for outcome in pipeline.process_record(record)]
-    windows = [outcome for outcome in told if isinstance(outcome, WindowOutcome)]
-    return windows, any(isinstance(outcome, ParameterSet) for outcome in told)
+    reported = [outcome for record in _record_live_rapid(rates) for outcome in pipeline.process_record(record)]
+    windows = [outcome for outcome in reported if isinstance(outcome, WindowOutcome)]
+    return windows, any(isinstance(outcome, ParameterSet) for outcome in reported)
 
 
 def test_complete_rapid_is_accepted_and_published(tmp_path: Path) -> None:

@@ -51,9 +51,9 @@ def _corrupt_window(window: Window, name: str, start: int, length: int, value: f
 def test_corrupt_window_gets_verdict(
     name: str, start: int, length: int, value: float, scale: float, method: str
 ) -> None:
-    spoilt = _corrupt_window(find_noisy_windows(0.003)[0], name, start, length, value, scale)
+    corrupted = _corrupt_window(find_noisy_windows(0.003)[0], name, start, length, value, scale)
     chosen = Identification(method=method)
-    outcome = analyse_window(spoilt, chosen)
+    outcome = analyse_window(corrupted, chosen)
     assert_verdict_with_reasons(outcome)
     pool_windows([outcome], chosen)
 

@@ -131,13 +131,13 @@ def _find_falling_rows(drop: float, time_s: Array) -> Array:
 def test_drive_creeping_to_demanded_speed_is_not_held() -> None:
     slow = replace(DRIVE, position_gain=23.0, feedforward=0.45)
     scene = replace(SCENE, drive=slow, move=Move(0.12, 0.22, 7.4, 0.02, 1))
-    for drop, said in ((0.0, []), (0.2, ["EpisodeAborted"])):
+    for drop, message in ((0.0, []), (0.2, ["EpisodeAborted"])):
         rates = drives.compute_path_speeds(scene.move, partial(_find_falling_rows, drop))
         rows = measure_run(
             np.random.default_rng(7), scene, drives.simulate_loop(slow, demand_of(scene, rates), scene.dt_s)
         )
         (window,) = find_windows(make_recording(scene, rows))
-        assert [reason.code for reason in find_interruptions(WindowSignals(window, Identification()))] == said
+        assert [reason.code for reason in find_interruptions(WindowSignals(window, Identification()))] == message
 
 
 def test_slow_plateau_is_detected_with_coarse_scale() -> None:

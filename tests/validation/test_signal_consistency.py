@@ -40,8 +40,8 @@ def list_refusals(recording: Recording) -> str:
 
 def change_signal(recording: Recording, name: str, change: Callable[[Array], Array]) -> Recording:
     values = np.array(getattr(recording, FIELDS[name]))
-    spoilt: Recording = replace(recording, **{FIELDS[name]: freeze_array(change(values))})  # type: ignore[arg-type]
-    return spoilt
+    corrupted: Recording = replace(recording, **{FIELDS[name]: freeze_array(change(values))})  # type: ignore[arg-type]
+    return corrupted
 
 
 @pytest.mark.parametrize("voltage", [True, False])
@@ -191,9 +191,9 @@ def test_valid_table_sensors_are_used_without_warning(table_window: Window) -> N
 def test_wrong_table_sensor_is_named_and_ignored(
     table_window: Window, field: str, change: Callable[[Array], Array], text: str
 ) -> None:
-    spoilt: Window = replace(table_window, **{field: freeze_array(change(np.array(getattr(table_window, field))))})  # type: ignore[arg-type]
+    corrupted: Window = replace(table_window, **{field: freeze_array(change(np.array(getattr(table_window, field))))})  # type: ignore[arg-type]
     without: Window = replace(table_window, **{field: None})  # type: ignore[arg-type]
-    found, expected = (analyse_window(window, SETTINGS) for window in (spoilt, without))
+    found, expected = (analyse_window(window, SETTINGS) for window in (corrupted, without))
     assert any(text in warning.text for warning in found.verdict.warnings)
     assert found.at_table == expected.at_table
     assert found.estimate is not None

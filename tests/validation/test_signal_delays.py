@@ -38,12 +38,12 @@ def _make_window(late: dict[str, int], sampling: VoltageSampling = "interval_mea
 @pytest.mark.parametrize(("name", "rows"), [("voltage", 3), ("voltage", 6), ("current", 2)])
 def test_late_signal_is_refused_with_delay(sampling: VoltageSampling, name: str, rows: int) -> None:
     reasons = analyse_window(_make_window({name: rows}, sampling), SETTINGS).verdict.reasons
-    told = [reason.text for reason in reasons if reason.code == "SampleTiming"]
-    assert told, reasons
-    late = "late" in told[0] if name in told[0].split()[0] else "early" in told[0]  # of the other signal
-    assert late, told
-    shown = float(re.findall(r"is [+-]?([\d.]+) (?:ms|samples)", told[0])[0])
-    ms = shown if " ms " in told[0] else 1e3 * FINE_S * shown
+    reported = [reason.text for reason in reasons if reason.code == "SampleTiming"]
+    assert reported, reasons
+    late = "late" in reported[0] if name in reported[0].split()[0] else "early" in reported[0]  # of the other signal
+    assert late, reported
+    shown = float(re.findall(r"is [+-]?([\d.]+) (?:ms|samples)", reported[0])[0])
+    ms = shown if " ms " in reported[0] else 1e3 * FINE_S * shown
     # what a regulator does within a sample makes an instant seem early
     assert ms == pytest.approx(1e3 * FINE_S * rows, abs=1e3 * FINE_S * (0.6 if sampling == "interval_mean" else 1.6))
 

@@ -18,12 +18,12 @@ def test_slow_sensor_study_covers_all_fault_kinds() -> None:
 
 def test_every_fault_kind_yields_slow_sensor_samples() -> None:
     for name in (GOOD, TO_AND_FRO, *KINDS):
-        spoilt = make_study_recording(3, 1, name)
-        slow = spoilt.recording.slow_voltage
+        corrupted = make_study_recording(3, 1, name)
+        slow = corrupted.recording.slow_voltage
         assert slow is not None, name
-        assert slow.period_s > spoilt.recording.dt_s, name
+        assert slow.period_s > corrupted.recording.dt_s, name
         assert slow.voltage_v.size > 20, name
-        assert (spoilt.severity > 0.0) == (name in KINDS), name
+        assert (corrupted.severity > 0.0) == (name in KINDS), name
 
 
 def test_fault_never_affects_unrecorded_voltage() -> None:

@@ -39,9 +39,9 @@ def test_current_offset_at_standstill_is_refused(share: float) -> None:
     off = share * float(np.abs(window.current_a).max())
     (reason,) = _list_standstill_faults(replace(window, current_a=freeze_array(window.current_a + off)))
     assert reason.code == "CalibrationSuspect"
-    told = re.search(r"reads (\S+) A", reason.text)
-    assert told is not None
-    assert float(told[1]) == pytest.approx(off, rel=0.1)
+    reported = re.search(r"reads (\S+) A", reason.text)
+    assert reported is not None
+    assert float(reported[1]) == pytest.approx(off, rel=0.1)
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.003, 0.005])

@@ -127,8 +127,8 @@ def test_dead_time_is_reported_in_volts() -> None:
         assert outcome.estimate is not None
         if "dead_time" in outcome.estimate.terms:
             continue
-        told = [*outcome.verdict.reasons, *outcome.verdict.warnings]
-        assert any("+2.0" in reason.text and "dead time" in reason.text for reason in told)
+        reported = [*outcome.verdict.reasons, *outcome.verdict.warnings]
+        assert any("+2.0" in reason.text and "dead time" in reason.text for reason in reported)
         for name, true in Mechanics().truth().items():
             assert abs(outcome.estimate.get_value(name) - true) < 3 * outcome.estimate.get_std(name)
 
@@ -153,10 +153,10 @@ def test_torque_to_table_error_matches_simulated_drive() -> None:
     mechanics, rows = Mechanics(Cd=1e-6), 1500
     loop = TorqueToTableError.derive(Parameters.from_mapping(mechanics.truth()), 20.0, AXIS)
     load = np.where(np.arange(rows) >= 500, 1.0, 0.0)
-    told = loop.convert_momentum_to_um(np.cumsum(load)[None] * PERIOD_S, PERIOD_S)[0]
+    reported = loop.convert_momentum_to_um(np.cumsum(load)[None] * PERIOD_S, PERIOD_S)[0]
     plant = bench.Plant(Cd=1e-6)
     moved = 1e6 * bench.simulate_bench(plant, np.zeros(rows), load=load).position
-    assert compute_rms(told + moved) < 0.05 * compute_rms(moved)
+    assert compute_rms(reported + moved) < 0.05 * compute_rms(moved)
 
 
 def test_noise_adds_no_unexplained_torque() -> None:

@@ -70,10 +70,10 @@ def test_data_sheet_replaces_voltage_of_drive_not_of_failed_sensor() -> None:
     assert outcome.verdict.accepted
     assert outcome.verdict.unexplained_um is not None
     assert 0.0 < outcome.verdict.unexplained_um < 20.0  # of a following error of 800 um
-    told = outcome.estimate
-    assert told is not None
-    assert told.given == ("R", "L", "K")
-    assert told.get_value("K") == 0.33
+    reported = outcome.estimate
+    assert reported is not None
+    assert reported.given == ("R", "L", "K")
+    assert reported.get_value("K") == 0.33
     (reason,) = analyse_window(window, SETTINGS, _make_axis("modbus")).verdict.reasons
     assert str(reason) == "SampleTiming: the window has no voltage"
 

@@ -56,8 +56,8 @@ def test_unit_error_is_named(signal: str, factor: float, words: str, recording: 
         made = (scale_position if signal == "position" else scale_speed)(recording, factor)
     verdict = analyse_window(make_window(made), Identification()).verdict
     assert not verdict.accepted
-    (told,) = [reason for reason in verdict.reasons if reason.code in ("CalibrationSuspect", "Implausible")]
-    assert words in told.text
+    (reported,) = [reason for reason in verdict.reasons if reason.code in ("CalibrationSuspect", "Implausible")]
+    assert words in reported.text
 
 
 def test_temperature_in_kelvin_only_warns(recording: Recording) -> None:

@@ -96,8 +96,8 @@ def test_stribeck_friction_is_term_or_reported() -> None:
     signals = bench.simulate_bench(bench.Plant(stribeck=12.0), bench.make_shuttle_demand())
     outcome = analyse_window(find_windows(parse_recording(bench.format_as_csv(signals, 0.003)))[0], SETTINGS)
     assert outcome.estimate is not None
-    told = [*outcome.verdict.reasons, *outcome.verdict.warnings]
-    assert "stribeck" in outcome.estimate.terms or any("Stribeck" in reason.text for reason in told)
+    reported = [*outcome.verdict.reasons, *outcome.verdict.warnings]
+    assert "stribeck" in outcome.estimate.terms or any("Stribeck" in reason.text for reason in reported)
 
 
 def test_untraced_lost_frames_are_refused() -> None:
@@ -151,11 +151,11 @@ def test_non_finite_values_are_refused_before_fit() -> None:
 def test_window_without_voltage_is_refused() -> None:
     outcome = analyse_window(replace(find_noisy_windows()[0], voltage_v=None), SETTINGS)
     assert not outcome.verdict.accepted
-    told = outcome.estimate
-    assert told is not None
+    reported = outcome.estimate
+    assert reported is not None
     for name, truth in (("Jt/K", 0.075 / 0.8), ("ft/K", 0.05 / 0.8), ("Cd/K", 5.0 / 0.8)):
-        assert abs(told.get_value(name) - truth) < 5 * told.get_std(name) < 0.4 * truth
-        assert np.isnan(told.get_value(name.split("/")[0]))
+        assert abs(reported.get_value(name) - truth) < 5 * reported.get_std(name) < 0.4 * truth
+        assert np.isnan(reported.get_value(name.split("/")[0]))
 
 
 def test_sensor_with_own_clock_is_aligned_by_data() -> None:

@@ -42,8 +42,8 @@ def test_explained_check_is_skipped() -> None:
 def test_false_alarm_budget_yields_every_threshold() -> None:
     assert sum(share.share for share in BUDGET.values()) <= 1.0
     deviations = {"structure": 4.5, "timing": 4.5, "play": 4.5, "whiteness": 5.0, "between windows": 5.0}
-    for name, told in (deviations | {"standstill": 5.5, "position": 6.0, "data sheet": 3.0}).items():
-        assert BUDGET[name].deviations == pytest.approx(told, abs=0.02)
+    for name, reported in (deviations | {"standstill": 5.5, "position": 6.0, "data sheet": 3.0}).items():
+        assert BUDGET[name].deviations == pytest.approx(reported, abs=0.02)
     for name, chance in {"stuck": 2e-3, "saturated": 1e-4, "slow voltage": 1e-5, "cut off": 1e-6}.items():
         assert BUDGET[name].chance == pytest.approx(chance)
 

@@ -83,8 +83,8 @@ class BrowserTab:
         self.page.add_init_script(f"sessionStorage.setItem({TOKEN_KEY!r}, {token!r})")
 
     def get_text(self, key: str, **values: str) -> str:
-        told = f"import('/static/text.js').then((m) => m.t({json.dumps(key)}, {json.dumps(values)}))"
-        return str(self.page.evaluate(told))
+        reported = f"import('/static/text.js').then((m) => m.t({json.dumps(key)}, {json.dumps(values)}))"
+        return str(self.page.evaluate(reported))
 
     def wait_for_text(self, where: str, text: str) -> None:
         self.page.locator(where).filter(has_text=text).first.wait_for()

@@ -66,8 +66,8 @@ async def serve_daemon(
 
     async def answer_request(request: Mapping[str, Any], peer: ClientProcess) -> Mapping[str, Any]:
         asked.append(request)
-        told = answer(request)
-        return await told if asyncio.iscoroutine(told) else told  # type: ignore[no-any-return]
+        reported = answer(request)
+        return await reported if asyncio.iscoroutine(reported) else reported  # type: ignore[no-any-return]
 
     config.run_directory.mkdir(parents=True, exist_ok=True)
     server = ControlServer(answer_request, lambda: {"checked_s": 1.0}, abandon, machine_config.Access())

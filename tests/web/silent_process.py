@@ -14,9 +14,9 @@ ENDING_S = 120.0
 class SilentProcess:
     def __init__(self, name: str, arguments: list[str], log: Path) -> None:
         self.name, self._log = name, log
-        with log.open("ab") as said:
+        with log.open("ab") as message:
             command = [sys.executable, "-m", *arguments]
-            self._child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+            self._child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=message, stderr=message)
 
     @property
     def pid(self) -> int:

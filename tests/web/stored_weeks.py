@@ -134,5 +134,5 @@ def damage_recording(window: Window, kind: int) -> Window:
 
 def write_learned_offsets(config: MachineConfig, program_digest: str, rows: int) -> None:
     offset = freeze_array(0.05 * np.sin(np.arange(rows) / 300.0))
-    lesson = LearnedOffset(dict.fromkeys(config.axis, offset), 10.3, 0.7, (3.4, 1.6, 0.9))
-    write_learned(make_learned_path(config.store.directory / "lessons", program_digest, config.digest), lesson)
+    learned = LearnedOffset(dict.fromkeys(config.axis, offset), 10.3, 0.7, (3.4, 1.6, 0.9))
+    write_learned(make_learned_path(config.store.directory / "lessons", program_digest, config.digest), learned)

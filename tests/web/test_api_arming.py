@@ -65,10 +65,15 @@ async def test_shown_plan_is_armed(config: MachineConfig) -> None:
         answer = await client.post("/api/machine/arm", json=await confirm_plan(client), headers=OWN)
         assert answer.json() == {"ok": True, "text": "armed part.ngc", "state": "ARMED"}
         assert token not in answer.text
-    told = next(request for request in asked if request["request"] == "arm")
+    reported = next(request for request in asked if request["request"] == "arm")
     path = str((config.store.directory.parent / "nc" / "part.ngc").resolve())
-    assert (told["program"], told["by"], told["token"], told["progress"]) == (path, "operator", token, True)
-    assert told["program_digest"] == DIGEST
+    assert (reported["program"], reported["by"], reported["token"], reported["progress"]) == (
+        path,
+        "operator",
+        token,
+        True,
+    )
+    assert reported["program_digest"] == DIGEST
 
 
 async def test_program_changed_since_plan_is_not_armed(config: MachineConfig) -> None:
@@ -98,10 +103,10 @@ async def test_daemon_refusal_is_returned_with_all_reasons(config: MachineConfig
     async with serving(config, SimulatedMachine()), make_client(make_app(config), "operator") as client:
         answer = await client.post("/api/machine/arm", json=await confirm_plan(client), headers=OWN)
         disarmed = await client.post("/api/machine/disarm", headers=OWN)
-    told = answer.json()
-    assert (answer.status_code, told["ok"], told["code"]) == (409, False, "ModelNotValidated")
-    assert told["advice"] == "run a few rapids of this axis"
-    assert told["refused"]
+    reported = answer.json()
+    assert (answer.status_code, reported["ok"], reported["code"]) == (409, False, "ModelNotValidated")
+    assert reported["advice"] == "run a few rapids of this axis"
+    assert reported["refused"]
     assert disarmed.json()["code"] == "GuardAbsent"
 
 

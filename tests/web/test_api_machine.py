@@ -41,13 +41,13 @@ async def test_running_daemon_is_shown_with_axes_and_next_steps(tmp_path: Path) 
         make_client(make_app(config), "watcher") as client,
     ):
         await status_when(path, lambda s: s["axes"]["X"]["accepted"] == 1)
-        told = (await client.get("/api/machine")).json()
+        reported = (await client.get("/api/machine")).json()
         stored = (await client.get("/api/machine/parameters")).json()["axes"]["X"]
         text = (await client.get("/api/machine")).text
-    assert told["status"]["axes"]["X"]["revision"] == stored["revision"] == 1
-    assert told["status"]["axes"]["X"]["drive_state"] == "Not ready to switch on"  # its statusword is 0
-    assert told["next"]
-    assert told["axes"]["X"]["light"] in ("good", "warn", "none")  # nothing comes behind the only rapid
+    assert reported["status"]["axes"]["X"]["revision"] == stored["revision"] == 1
+    assert reported["status"]["axes"]["X"]["drive_state"] == "Not ready to switch on"  # its statusword is 0
+    assert reported["next"]
+    assert reported["axes"]["X"]["light"] in ("good", "warn", "none")  # nothing comes behind the only rapid
     shown = stored["parameters"]["R"]
     assert shown["low"] < shown["value"] < shown["high"]
     assert (shown["unit"], shown["change"], shown["limit"], shown["light"]) == ("ohm", 0.0, 0.3, "good")
@@ -62,21 +62,21 @@ async def test_silent_daemon_is_reported_and_stored_data_shown(tmp_path: Path) -
     async with make_client(make_app(config)) as client:
         answer = await client.get("/api/machine")
         stored = (await client.get("/api/machine/parameters")).json()
-    told = answer.json()
-    assert (answer.status_code, told["status"], told["axes"]["X"]["light"]) == (200, None, "none")
-    assert told["fault"]["code"] == "ConnectError"
-    assert "start it with fdhil run CONFIG" in told["fault"]["advice"]
-    assert told["next"][0]["text"] == "The daemon does not answer."
+    reported = answer.json()
+    assert (answer.status_code, reported["status"], reported["axes"]["X"]["light"]) == (200, None, "none")
+    assert reported["fault"]["code"] == "ConnectError"
+    assert "start it with fdhil run CONFIG" in reported["fault"]["advice"]
+    assert reported["next"][0]["text"] == "The daemon does not answer."
     moved = stored["axes"]["X"]["parameters"]["Jt"]
     assert (moved["first"], moved["light"]) == (BENCH.Jt, "bad")
 
 
 async def test_missing_store_is_reported(tmp_path: Path) -> None:
     async with make_client(make_app(write_machine(tmp_path, users=False))) as client:
-        told = (await client.get("/api/machine/parameters")).json()
-    assert told["axes"] == {}
-    assert told["fault"]["code"] == "NoHistory"
-    assert told["fault"]["advice"] == "run the daemon first"
+        reported = (await client.get("/api/machine/parameters")).json()
+    assert reported["axes"] == {}
+    assert reported["fault"]["code"] == "NoHistory"
+    assert reported["fault"]["advice"] == "run the daemon first"
 
 
 async def test_many_browsers_cause_one_status_request(tmp_path: Path) -> None:
@@ -89,9 +89,9 @@ async def test_many_browsers_cause_one_status_request(tmp_path: Path) -> None:
 
 async def test_surrogates_and_nan_do_not_break_responses(tmp_path: Path) -> None:
     config = write_machine(tmp_path)
-    told = {**STATUS, "text": "b\udcf6hlen.ngc", "ratio": math.nan}
+    reported = {**STATUS, "text": "b\udcf6hlen.ngc", "ratio": math.nan}
     async with (
-        serve_daemon(config, lambda request: {**told, "ok": request["request"] == "status", "code": "NoTable"}),
+        serve_daemon(config, lambda request: {**reported, "ok": request["request"] == "status", "code": "NoTable"}),
         make_client(make_app(config), "operator", **OWN) as client,
     ):
         answer = await client.get("/api/machine")

@@ -59,8 +59,8 @@ async def _get_document(client: httpx.AsyncClient, **wanted: Any) -> Any:
 
 
 async def test_unacknowledged_alarms_come_first_with_explanation(client: httpx.AsyncClient) -> None:
-    told = await _get_document(client)
-    due, tripped = told["waiting"]  # what is active is in front
+    reported = await _get_document(client)
+    due, tripped = reported["waiting"]  # what is active is in front
     assert (due["state"], due["until"], tripped["state"], tripped["count"]) == ("active", None, "gone", 2)
     assert (tripped["newest"]["code"], tripped["numbers"], due["newest"]["code"]) == (
         "GuardTripped", [4, 2], "MaintenanceDue",
@@ -69,8 +69,13 @@ async def test_unacknowledged_alarms_come_first_with_explanation(client: httpx.A
     assert newest["cause"] == "EchoMismatch: axis X: the drive's offset is not the one that was sent"
     assert newest["effect"] == "the offset is ramped to zero and the correction is off until it is armed again"
     assert newest["action"] == "check the PDO mapping and the scaling"
-    assert (told["active_count"], told["waiting_count"], told["waiting_major"], told["newest_waiting"]) == (1, 3, 2, 4)
-    assert [(event["code"], event["acknowledged"]["who"]) for event in told["others"]] == [("StrayFiles", "anna")]
+    assert (
+        reported["active_count"],
+        reported["waiting_count"],
+        reported["waiting_major"],
+        reported["newest_waiting"],
+    ) == (1, 3, 2, 4)
+    assert [(event["code"], event["acknowledged"]["who"]) for event in reported["others"]] == [("StrayFiles", "anna")]
 
 
 async def test_end_of_alarm_is_shown_as_until(client: httpx.AsyncClient, machine: MachineConfig) -> None:
@@ -79,11 +84,11 @@ async def test_end_of_alarm_is_shown_as_until(client: httpx.AsyncClient, machine
             Notice("MaintenanceDue", "info", "ft is back at 0.05 N.m.s", "Y"), TimeStamp(1.8e9, "boot", 9)
         )
         history.add_acknowledgement(Acknowledgement((3,), "anna", "", TimeStamp.now()))
-    told = await _get_document(client)
-    assert [kind["newest"]["code"] for kind in told["waiting"]] == ["GuardTripped"]
-    due = next(event for event in told["others"] if event["code"] == "MaintenanceDue")
+    reported = await _get_document(client)
+    assert [kind["newest"]["code"] for kind in reported["waiting"]] == ["GuardTripped"]
+    due = next(event for event in reported["others"] if event["code"] == "MaintenanceDue")
     assert (due["severity"], due["until"]) == ("minor", "2027-01-15T08:00:00+00:00")
-    assert [event["code"] for event in told["others"]].count("MaintenanceDue") == 1
+    assert [event["code"] for event in reported["others"]].count("MaintenanceDue") == 1
 
 
 async def test_event_list_is_filtered_and_paged(client: httpx.AsyncClient, machine: MachineConfig) -> None:
@@ -117,9 +122,9 @@ async def test_acknowledgement_is_stored_by_daemon_and_shown(client: httpx.Async
         assert [notice["code"] for notice in status["unacknowledged"]["newest"]] == ["MaintenanceDue"]
         unknown = await client.post("/api/events/acknowledge", json={"notices": [99]})
         assert (unknown.status_code, unknown.json()["code"]) == (409, "NoSuchNotice")
-    told = await _get_document(client)
-    assert [kind["newest"]["code"] for kind in told["waiting"]] == ["MaintenanceDue"]
-    given = next(event for event in told["others"] if event["number"] == 4)["acknowledged"]
+    reported = await _get_document(client)
+    assert [kind["newest"]["code"] for kind in reported["waiting"]] == ["MaintenanceDue"]
+    given = next(event for event in reported["others"] if event["number"] == 4)["acknowledged"]
     assert (given["who"], given["note"]) == ("operator", "the mapping was wrong")
     course = (await client.get("/api/history/X")).json()["notices"][0]
     assert course["acknowledged"]["who"] == "operator"

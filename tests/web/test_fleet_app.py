@@ -59,9 +59,9 @@ def test_cached_answer_expires_and_cache_is_limited() -> None:
 
 async def test_axis_has_all_trends_up_to_page_limit() -> None:
     async with make_client(make_fleet_app(Web(), RecordedQueries())) as client:
-        told = (await client.get("/api/fleet/axis?machine=mill-1&axis=X")).json()
-        assert [course["parameter"] for course in told["courses"]] == ["R", "L", "K", "Jt", "ft", "Cd"]
-        assert [course["sets"][0]["value"] for course in told["courses"]] == [5.0] * 6
+        reported = (await client.get("/api/fleet/axis?machine=mill-1&axis=X")).json()
+        assert [course["parameter"] for course in reported["courses"]] == ["R", "L", "K", "Jt", "ft", "Cd"]
+        assert [course["sets"][0]["value"] for course in reported["courses"]] == [5.0] * 6
         missing = await client.get("/api/fleet/axis?machine=mill-1&axis=Q")
         assert (missing.status_code, missing.json()["code"]) == (404, "NoSuchAxis")
         for wrong in ("axis?machine=a%20b&axis=X", "axis?machine=a&axis=XY", "compare?parameter=q"):

@@ -55,8 +55,8 @@ async def test_each_axis_is_summarised(client: httpx.AsyncClient) -> None:
 async def test_trends_have_intervals_limits_and_stored_figures(
     client: httpx.AsyncClient, machine: MachineConfig
 ) -> None:
-    told = await _get_document(client, "/X")
-    courses = {course["parameter"]: course for course in told["courses"]}
+    reported = await _get_document(client, "/X")
+    courses = {course["parameter"]: course for course in reported["courses"]}
     assert {"R", "L", "K", "Jt", "ft", "Cd"} <= set(courses)
     with History.open_read_only(machine.store.directory) as history:
         newest = [window for window in history.read_windows("X") if window.accepted][-1]
@@ -70,8 +70,8 @@ async def test_trends_have_intervals_limits_and_stored_figures(
     assert all(low <= y <= high for low, y, high in zip(points["low"], points["y"], points["high"], strict=True))
     assert {trace["colour"] for trace in courses["R"]["over_time"]["panels"][0]["traces"]} <= {1, 2, 3}
     assert courses["Cd"]["over_temperature"] is not None  # it falls with warmth
-    assert [change["cause"] for change in told["changes"]] == ["a changed load"]
-    assert told["latest"][0]["parameter"] == "R"
+    assert [change["cause"] for change in reported["changes"]] == ["a changed load"]
+    assert reported["latest"][0]["parameter"] == "R"
 
 
 async def test_every_number_is_finite_json(client: httpx.AsyncClient) -> None:

@@ -75,10 +75,10 @@ async def test_invalid_stream_is_reported_and_next_one_read(
 
 @pytest.mark.parametrize("answer", ["no JSON", DEEP, "[1]", '{"progress": 1', '{"progress": 1}', '{"progress"}'])
 async def test_invalid_answer_is_refused(answer: str, tmp_path: Path) -> None:
-    heard: list[Any] = []
+    received: list[Any] = []
     async with serve_answers(tmp_path / "s", answer + "\n{"):
         with pytest.raises(ConnectError, match="without an answer"):
-            await DaemonClient(tmp_path / "s").send_request({"request": "arm"}, WAIT_S, progress=heard.append)
+            await DaemonClient(tmp_path / "s").send_request({"request": "arm"}, WAIT_S, progress=received.append)
 
 
 async def test_requests_do_not_queue_for_silent_daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -147,12 +147,12 @@ async def test_samples_are_streamed_and_kept_over_daemon_restart(
             assert browser.parts[-1][0]["first_tick"] > end
         async with httpx.AsyncClient(timeout=WAIT_S) as client:
             query = {"first_tick": end - 20, "end_tick": end, "columns": 100}
-            told = (await client.get(f"http://{place}/api/live/samples", params=query)).json()
-    signal = told["axes"]["X"]["current_a"]
-    assert (told["ticks_per_column"], signal["unit"], len(signal["low"])) == (1, "A", 20)
+            reported = (await client.get(f"http://{place}/api/live/samples", params=query)).json()
+    signal = reported["axes"]["X"]["current_a"]
+    assert (reported["ticks_per_column"], signal["unit"], len(signal["low"])) == (1, "A", 20)
     assert signal["low"] == signal["high"]
     assert np.diff(signal["low"]).tolist() == [2.0] * 19
-    assert told["axes"]["X"]["temperature_c"]["low"] == [None] * 20
+    assert reported["axes"]["X"]["temperature_c"]["low"] == [None] * 20
 
 
 @pytest.mark.usefixtures("real_time")
@@ -201,13 +201,13 @@ async def test_invalid_browser_message_ends_its_socket(
     async with serve_pages(config_of(tmp_path)) as place:
         with pytest.raises((ConnectionClosed, InvalidStatus)) as error:
             await _read_close_reason(place, query, says)
-    told = error.value
-    if isinstance(told, ConnectionClosed):
-        assert told.rcvd is not None
-        assert told.rcvd.code == code
+    reported = error.value
+    if isinstance(reported, ConnectionClosed):
+        assert reported.rcvd is not None
+        assert reported.rcvd.code == code
     else:
-        assert isinstance(told, InvalidStatus)
-        assert told.response.status_code == code
+        assert isinstance(reported, InvalidStatus)
+        assert reported.response.status_code == code
 
 
 async def _read_close_reason(place: str, query: str, says: str | bytes | None) -> None:
@@ -290,7 +290,7 @@ async def test_stream_needs_login_and_ends_with_it(tmp_path: Path, monkeypatch: 
         async with open_stream(place, subprotocols=["fdhil", f"bearer.{token}"]) as socket:
             await socket.recv()
             write_users(tmp_path / "users.json", {})
-            told: list[object] = []
+            reported: list[object] = []
             with pytest.raises(ConnectionClosed, match="the login has expired"):
-                await read_until_closed(socket, told)
-            assert len(told) <= 1  # which was on its way
+                await read_until_closed(socket, reported)
+            assert len(reported) <= 1  # which was on its way

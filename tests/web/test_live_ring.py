@@ -87,16 +87,16 @@ def decode_message(message: bytes) -> tuple[dict[str, Any], list[Any]]:
 
 
 def test_browser_receives_each_column_once_in_order() -> None:
-    ring, view, told = make_filled_ring(10_000, range(2000)), LiveView(["X"], 1.0, 100, PERIOD_S), []
+    ring, view, reported = make_filled_ring(10_000, range(2000)), LiveView(["X"], 1.0, 100, PERIOD_S), []
     for end in range(2003, 4000, 37):
         ring.put_samples(np.arange(ring.end, end), make_samples(range(ring.end, end)))
         assert view.may_send()
         header, low = decode_message(view.make_message({"X": ring}, {"trouble": ""}))
-        told += [each for part in low for each in part[0].tolist()]
+        reported += [each for part in low for each in part[0].tolist()]
         assert all(part["per_column"] == 10 and part["skipped_ticks"] == 0 for part in header["parts"])
         view.acknowledge_drawn(header["number"])
-    assert told == list(range(1010, 1010 + 10 * len(told), 10))  # one second back, then what came
-    assert told[-1] == ring.end // 10 * 10 - 10
+    assert reported == list(range(1010, 1010 + 10 * len(reported), 10))  # one second back, then what came
+    assert reported[-1] == ring.end // 10 * 10 - 10
 
 
 def test_slow_browser_gets_wider_columns_and_skip_count() -> None:

@@ -71,9 +71,9 @@ def test_faulty_users_file_is_reported_without_content(tmp_path: Path, text: str
     path = tmp_path / "users"
     path.write_text(text)
     path.chmod(0o600)
-    with pytest.raises(ConfigError, match="is not a users file") as told:
+    with pytest.raises(ConfigError, match="is not a users file") as reported:
         LoginManager(path)
-    assert "c2VjcmV0" not in str(told.value)
+    assert "c2VjcmV0" not in str(reported.value)
 
 
 async def test_login_ends_by_lifetime_idleness_and_logout(logins: LoginManager, clock: Clock) -> None:
@@ -149,9 +149,9 @@ async def test_guesses_are_throttled_by_user_and_address(
     for k in range(FREE_GUESSES):
         with pytest.raises(RequestRefused, match="wrong name or password"):
             await logins.log_in("op", f"guess {k}", "192.0.2.1")
-    with pytest.raises(RequestRefused, match="too many logins failed") as told:
+    with pytest.raises(RequestRefused, match="too many logins failed") as reported:
         await logins.log_in("ann", PASSWORD, "192.0.2.1")  # the same place, another user
-    assert told.value.status == 429
+    assert reported.value.status == 429
     assert len(looked) == FREE_GUESSES  # a refused one costs nothing
     with pytest.raises(RequestRefused, match="wrong name or password"):
         await logins.log_in("op", "guess", "192.0.2.2")  # elsewhere, the same user: one guess, and no more
@@ -173,12 +173,12 @@ async def test_unknown_user_takes_as_long_as_wrong_password(
         return real(password, **settings)
 
     monkeypatch.setattr("hashlib.scrypt", counted)
-    told = []
+    reported = []
     for name in ("op", "nobody"):
         with pytest.raises(RequestRefused) as refused:
             await logins.log_in(name, "a wrong one", "127.0.0.1")
-        told.append(refused.value.document)
-    assert told[0] == told[1]
+        reported.append(refused.value.document)
+    assert reported[0] == reported[1]
     assert hashes[0] == hashes[1] == 2**15
 
 

@@ -90,19 +90,19 @@ def drop_program(client: PageClient, name: str, content: bytes) -> str:
 def is_over(client: PageClient, digest: str, part: str = "") -> dict[str, Any]:
     end = time.monotonic() + LONG_ENOUGH_S
     while time.monotonic() < end:
-        told: dict[str, Any] = client.get(f"/api/program/{digest}").json()
-        told = told[part] if part else told
-        if told["state"] in ("done", "failed", "cancelled"):
-            return told
+        reported: dict[str, Any] = client.get(f"/api/program/{digest}").json()
+        reported = reported[part] if part else reported
+        if reported["state"] in ("done", "failed", "cancelled"):
+            return reported
         client.wait_until_over()
     raise AssertionError("the forecast did not end")
 
 
 @pytest.fixture(scope="module")
 def judged(client: PageClient, processes: None) -> dict[str, Any]:
-    told = is_over(client, drop_program(client, "../shop\\bench.ngc", PROGRAM.read_bytes()))
-    assert told["state"] == "done", told
-    return told
+    reported = is_over(client, drop_program(client, "../shop\\bench.ngc", PROGRAM.read_bytes()))
+    assert reported["state"] == "done", reported
+    return reported
 
 
 def get_document(client: PageClient, judged: dict[str, Any], path: str, **query: Any) -> Any:
@@ -118,15 +118,15 @@ def planned(machine: MachineConfig) -> Any:
 
 @pytest.mark.usefixtures("processes")
 def test_forecast_equals_command_output(judged: dict[str, Any], planned: Any) -> None:
-    told = judged["forecast"]
+    reported = judged["forecast"]
     assert judged["name"] == "bench.ngc"
-    assert_allclose(told["before"]["rms_um"], planned.before.rms_um)
-    assert_allclose(told["after"]["rms_um"], planned.after.rms_um)
-    assert told["parameters"]["X"]["revision"] == 0
-    assert [zone["before_um"] for zone in told["zones"]] == sorted(
+    assert_allclose(reported["before"]["rms_um"], planned.before.rms_um)
+    assert_allclose(reported["after"]["rms_um"], planned.after.rms_um)
+    assert reported["parameters"]["X"]["revision"] == 0
+    assert [zone["before_um"] for zone in reported["zones"]] == sorted(
         (zone.max_um for zone in planned.before.zones), reverse=True
     )
-    assert {zone["place"] for zone in told["zones"]} >= {1, 2, 3, 4}
+    assert {zone["place"] for zone in reported["zones"]} >= {1, 2, 3, 4}
 
 
 def test_forecast_uses_the_loops_that_the_newest_set_was_validated_with(tmp_path: Path) -> None:
@@ -134,9 +134,9 @@ def test_forecast_uses_the_loops_that_the_newest_set_was_validated_with(tmp_path
     with History.open(own.store.directory) as history:
         found = replace(make_published(), config_digest=own.digest, loops={"speed_filter_s": 0.002})
         history.add_revision(found, [], TimeStamp.now())
-    models, told, used = forecast_process.load_newest_models(load_trajectory(PROGRAM, own), own)
+    models, reported, used = forecast_process.load_newest_models(load_trajectory(PROGRAM, own), own)
     assert models["X"] == found.parameters
-    assert (told["X"]["revision"], told["Y"]["revision"]) == (1, 0)
+    assert (reported["X"]["revision"], reported["Y"]["revision"]) == (1, 0)
     assert used.axis["X"].regulators.speed_filter_s == 0.002
     assert used.axis["Y"] == own.axis["Y"]
 
@@ -274,12 +274,12 @@ class AnyRefusal:
 
 @pytest.mark.usefixtures("processes")
 def test_faulty_program_is_refused_with_its_line(client: PageClient) -> None:
-    told = is_over(client, drop_program(client, "bad.ngc", b"G21 G90\nG1 X10 Y10 F1000\nG1 X1..5\nM2\n"))
-    assert told["state"] == "failed"
-    assert told["fault"]["code"] == "ProgramError"
-    assert told["fault"]["line"] == 3
-    assert "drop it again" in told["fault"]["advice"]
-    early = client.get(f"/api/program/{told['digest']}/view", params={"across": "X", "along": "Y"})
+    reported = is_over(client, drop_program(client, "bad.ngc", b"G21 G90\nG1 X10 Y10 F1000\nG1 X1..5\nM2\n"))
+    assert reported["state"] == "failed"
+    assert reported["fault"]["code"] == "ProgramError"
+    assert reported["fault"]["line"] == 3
+    assert "drop it again" in reported["fault"]["advice"]
+    early = client.get(f"/api/program/{reported['digest']}/view", params={"across": "X", "along": "Y"})
     assert (early.status_code, early.json()["code"]) == (409, "NotReady")
 
 
@@ -287,8 +287,8 @@ def test_faulty_program_is_refused_with_its_line(client: PageClient) -> None:
 def test_cancelled_forecast_ends_its_process(client: PageClient) -> None:
     squares = "\n".join(["G21 G90 F300", *(f"G1 X{100 * (k % 2)} Y{k}" for k in range(40)), "M2"])
     digest = drop_program(client, "slow.ngc", squares.encode())
-    told = client.post(f"/api/program/{digest}/cancel", headers=WRITES).json()
-    assert told["state"] == "cancelled"
+    reported = client.post(f"/api/program/{digest}/cancel", headers=WRITES).json()
+    assert reported["state"] == "cancelled"
     assert is_over(client, digest)["state"] == "cancelled"
     assert client.post(f"/api/program/{digest}/cancel", headers=WRITES).json()["state"] == "cancelled"
 
@@ -325,12 +325,12 @@ def test_shown_name_is_printable() -> None:
 
 def test_learning_curves_are_of_this_machine_only(client: PageClient, machine: MachineConfig) -> None:
     folder = machine.store.directory / "lessons"
-    lesson = LearnedOffset({"X": np.zeros(3)}, without_um=9.0, curve_um=(9.0, 3.0, 1.0))
-    write_learned(make_learned_path(folder, "ab" * 32, machine.digest), lesson)
-    write_learned(make_learned_path(folder, "cd" * 32, "ef" * 32), lesson)
-    told = client.get("/api/program/learning").json()
-    assert told["daemon"] is False
-    (learned,) = told["lessons"]
+    offsets = LearnedOffset({"X": np.zeros(3)}, without_um=9.0, curve_um=(9.0, 3.0, 1.0))
+    write_learned(make_learned_path(folder, "ab" * 32, machine.digest), offsets)
+    write_learned(make_learned_path(folder, "cd" * 32, "ef" * 32), offsets)
+    reported = client.get("/api/program/learning").json()
+    assert reported["daemon"] is False
+    (learned,) = reported["lessons"]
     assert learned["program"] == "ab" * 16
     assert learned["curve_um"] == [9.0, 3.0, 1.0]
 
@@ -365,11 +365,11 @@ def test_program_of_the_folder_is_forecast_by_its_name(machine: MachineConfig, t
     web = machine.web.model_copy(update={"programs_directory": tmp_path})
     client = PageClient(make_app(machine.model_copy(update={"web": web})))
     try:
-        told = client.post("/api/program/named?name=part.ngc", headers=WRITES).json()
-        while told["state"] in ("waiting", "computing"):
+        reported = client.post("/api/program/named?name=part.ngc", headers=WRITES).json()
+        while reported["state"] in ("waiting", "computing"):
             client.wait_until_over()
-            told = client.get(f"/api/program/{told['digest']}").json()
-        assert (told["state"], told["name"]) == ("done", "part.ngc")
+            reported = client.get(f"/api/program/{reported['digest']}").json()
+        assert (reported["state"], reported["name"]) == ("done", "part.ngc")
         assert client.post("/api/program/named?name=other.ngc", headers=WRITES).status_code == 404
         assert client.post("/api/program/named?name=../machine.toml", headers=WRITES).status_code == 422
         assert client.get("/api/program/jobs").json() == {"jobs": []}

@@ -113,17 +113,17 @@ async def test_rare_reason_is_searched_in_sections(client: httpx.AsyncClient, mo
 
 
 async def test_rapid_details_equal_the_history(client: httpx.AsyncClient, machine: MachineConfig) -> None:
-    told = await _get_document(client, "/X/31")
+    reported = await _get_document(client, "/X/31")
     with History.open_read_only(machine.store.directory) as history:
         stored = next(window for window in history.read_windows("X") if window.number == 31)
-    assert (told["older_id"], told["newer_id"], told["alike_id"]) == (29, 33, 27)
-    assert told["rapid"]["fit_percent"] == stored.fit_percent
+    assert (reported["older_id"], reported["newer_id"], reported["alike_id"]) == (29, 33, 27)
+    assert reported["rapid"]["fit_percent"] == stored.fit_percent
     assert stored.parameters is not None
-    for figure in told["parameters"]:
+    for figure in reported["parameters"]:
         known = stored.parameters[figure["name"]]
         assert (figure["value"], figure["std"]) == (known["value"], known["std"])
         assert figure["low"] < figure["value"] < figure["high"]
-    assert next(f for f in told["parameters"] if f["name"] == "R")["shown_unit"] == "mΩ"
+    assert next(f for f in reported["parameters"] if f["name"] == "R")["shown_unit"] == "mΩ"
     first = await _get_document(client, "/X/1")
     assert (first["older_id"], first["alike_id"]) == (None, None)
 
@@ -146,13 +146,13 @@ async def test_overlaid_model_is_the_judged_one(client: httpx.AsyncClient) -> No
 async def _check_overlay(client: httpx.AsyncClient, number: int) -> None:
     axis = "X" if number % 2 else "Y"
     rapid = (await _get_document(client, f"/{axis}/{number}"))["rapid"]
-    told = await _get_document(client, f"/{axis}/{number}/signals")
-    signals = {signal["name"]: Signal(**signal) for signal in told["signals"]}
+    reported = await _get_document(client, f"/{axis}/{number}/signals")
+    signals = {signal["name"]: Signal(**signal) for signal in reported["signals"]}
     assert list(signals) == ["voltage_v", "current_a", "speed_rad_s", "following_error_um"]
-    assert told["replayed"]["accepted"] == rapid["accepted"]
-    assert told["replayed"]["unexplained_um"] == rapid["unexplained_um"]
-    assert [said["code"] for said in told["replayed"]["reasons"]] == [said["code"] for said in rapid["reasons"]]
-    assert all(said["advice"] for said in told["replayed"]["reasons"])
+    assert reported["replayed"]["accepted"] == rapid["accepted"]
+    assert reported["replayed"]["unexplained_um"] == rapid["unexplained_um"]
+    assert [said["code"] for said in reported["replayed"]["reasons"]] == [said["code"] for said in rapid["reasons"]]
+    assert all(said["advice"] for said in reported["replayed"]["reasons"])
 
     speed, error = signals["speed_rad_s"], signals["following_error_um"]
     assert (speed.model, error.model, signals["voltage_v"].model) == ("voltage", "loop", None)
@@ -162,9 +162,9 @@ async def _check_overlay(client: httpx.AsyncClient, number: int) -> None:
     assert 100.0 * (1.0 - apart) == pytest.approx(rapid["fit_percent"], abs=1e-3)
     assert np.allclose(_list_numbers(speed.residual), measured - modelled, atol=1e-3)
     assert (error.unit, error.shown_unit) == ("um", "µm")
-    assert [stage["name"] for stage in told["stages"]] == ["accelerate", "cruise", "brake"]
-    assert len(told["time_s"]) == measured.size
-    assert len(told["frequency_hz"]) == len(speed.measured_spectrum) == measured.size // 2 + 1
+    assert [stage["name"] for stage in reported["stages"]] == ["accelerate", "cruise", "brake"]
+    assert len(reported["time_s"]) == measured.size
+    assert len(reported["frequency_hz"]) == len(speed.measured_spectrum) == measured.size // 2 + 1
 
 
 def _list_numbers(points: list[float | None] | None) -> Any:
@@ -324,34 +324,34 @@ def _get_signals(window: Window, config: MachineConfig) -> dict[str, Signal]:
 
 
 def test_closed_loop_is_overlaid_without_voltage(rapid: Window, machine: MachineConfig) -> None:
-    told = _get_signals(replace(rapid, voltage_v=None, torque_constant_nm_per_a=0.8), machine)
-    assert "voltage_v" not in told
+    reported = _get_signals(replace(rapid, voltage_v=None, torque_constant_nm_per_a=0.8), machine)
+    assert "voltage_v" not in reported
     for name, limit in (("speed_rad_s", 0.01), ("current_a", 0.02)):
-        signal = told[name]
+        signal = reported[name]
         assert signal.model == "loop"
         assert signal.residual_rms is not None
         assert signal.residual_rms < limit * np.nanmax(np.abs(_list_numbers(signal.measured)))
 
 
 def test_unknown_axis_is_shown_without_loop(rapid: Window, machine: MachineConfig) -> None:
-    told = _get_signals(replace(rapid, axis="Z"), machine)
-    assert told["speed_rad_s"].model == "voltage"
-    assert told["following_error_um"].model is None
+    reported = _get_signals(replace(rapid, axis="Z"), machine)
+    assert reported["speed_rad_s"].model == "voltage"
+    assert reported["following_error_um"].model is None
 
 
 def test_recorded_offsets_and_table_encoder_are_shown(rapid: Window, machine: MachineConfig) -> None:
     moved = replace(
         rapid, offset_mm=freeze_array(np.full(rapid.n, 2e-3)), table_mm=freeze_array(rapid.demand_mm + 5e-3)
     )
-    told = _get_signals(moved, machine)
-    assert set(told["offset_um"].measured) == {2.0}
-    assert told["table_error_um"].measured == pytest.approx([5.0] * rapid.n, abs=1e-6)
+    reported = _get_signals(moved, machine)
+    assert set(reported["offset_um"].measured) == {2.0}
+    assert reported["table_error_um"].measured == pytest.approx([5.0] * rapid.n, abs=1e-6)
 
 
 @pytest.mark.parametrize("value", [math.nan, 0.0, 1e300])
 def test_implausible_signals_are_shown_without_model(value: float, rapid: Window, machine: MachineConfig) -> None:
-    told = _get_signals(replace(rapid, speed_rad_s=freeze_array(np.full(rapid.n, value))), machine)
-    measured = told["speed_rad_s"].measured
+    reported = _get_signals(replace(rapid, speed_rad_s=freeze_array(np.full(rapid.n, value))), machine)
+    measured = reported["speed_rad_s"].measured
     assert len(measured) == rapid.n
     assert all(v is None or v == value for v in measured)
 
@@ -359,9 +359,9 @@ def test_implausible_signals_are_shown_without_model(value: float, rapid: Window
 def test_lost_samples_are_null(rapid: Window, machine: MachineConfig) -> None:
     speed = rapid.speed_rad_s.copy()
     speed[400:402] = math.nan
-    told = _get_signals(replace(rapid, speed_rad_s=freeze_array(speed), gaps=((400, 402),)), machine)["speed_rad_s"]
-    assert [k for k, v in enumerate(told.measured) if v is None] == [400, 401]
-    assert all(v is not None for v in told.measured_spectrum)
+    reported = _get_signals(replace(rapid, speed_rad_s=freeze_array(speed), gaps=((400, 402),)), machine)["speed_rad_s"]
+    assert [k for k, v in enumerate(reported.measured) if v is None] == [400, 401]
+    assert all(v is not None for v in reported.measured_spectrum)
 
 
 @pytest.mark.parametrize("rows", [1000, 1001])
@@ -380,10 +380,10 @@ def test_long_recording_is_thinned_and_keeps_peaks(rapid: Window, machine: Machi
         name: freeze_array(np.append(getattr(rapid, name), np.full(rows - rapid.n, getattr(rapid, name)[-1])))
         for name in ("demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v")
     }
-    told = make_rapid_signals(ModelOverlay(replace(rapid, **longer), overlay_model(rapid, machine).outcome))
-    assert told.every == 3
-    assert len(told.time_s) == len(told.signals[0].measured) <= MOST_POINTS
-    assert len(told.frequency_hz) == len(told.signals[0].measured_spectrum) <= MOST_POINTS
+    reported = make_rapid_signals(ModelOverlay(replace(rapid, **longer), overlay_model(rapid, machine).outcome))
+    assert reported.every == 3
+    assert len(reported.time_s) == len(reported.signals[0].measured) <= MOST_POINTS
+    assert len(reported.frequency_hz) == len(reported.signals[0].measured_spectrum) <= MOST_POINTS
     hum = np.sin(2 * math.pi * 100.0 * np.arange(rows) * 1e-3)
     assert compute_spectrum(hum).max() == pytest.approx(1.0, rel=0.05)
 

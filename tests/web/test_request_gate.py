@@ -59,8 +59,8 @@ def test_routes_of_both_kinds_exist(record_property: Callable[[str, object], Non
     assert ("POST", "/api/machine/arm") in WRITES
     assert ("POST", DISARM) in WRITES
     assert ("GET", "/api/machine") in READS
-    told = f"{len(WRITES)} routes that write, each refused without a login, from another page and by another name"
-    record_property("goal", told)
+    reported = f"{len(WRITES)} routes that write, each refused without a login, from another page and by another name"
+    record_property("goal", reported)
 
 
 def test_no_route_exists_outside_the_pages(app: FastAPI) -> None:

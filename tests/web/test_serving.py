@@ -39,10 +39,10 @@ def test_default_serves_only_this_computer() -> None:
 def test_remote_access_requires_tls_and_users_or_unprotected(host: str) -> None:
     assert not is_loopback(host)
     for given, missing in (({}, 2), (TLS, 1), (USERS, 1)):
-        with pytest.raises(ConfigError) as told:
+        with pytest.raises(ConfigError) as reported:
             serving.check_reach(Web(host=host, **given))
-        assert len(told.value.faults) == missing
-        assert "other computers can reach" in str(told.value) or "users_file" in str(told.value)
+        assert len(reported.value.faults) == missing
+        assert "other computers can reach" in str(reported.value) or "users_file" in str(reported.value)
     serving.check_reach(Web(host=host, **TLS, **USERS))
     serving.check_reach(Web(host=host, unprotected=True))
     with pytest.raises(ConfigError, match="operators send passwords"):  # no word helps against that
@@ -88,8 +88,8 @@ def test_users_are_added_and_removed(tmp_path: Path, capsys: Capture, monkeypatc
     def run(password: str, *more: str) -> tuple[int, str]:
         return run_with_password(password, "web-user", path, *more, capsys=capsys, monkeypatch=monkeypatch)
 
-    code, said = run(f"{CANARY} long enough", "op", "--role", "operate")
-    assert (code, CANARY in said) == (0, False)
+    code, message = run(f"{CANARY} long enough", "op", "--role", "operate")
+    assert (code, CANARY in message) == (0, False)
     assert verify_password(read_users(users)["op"], f"{CANARY} long enough")
     assert read_users(users)["op"].role == "operate"
     assert run("short", "ann")[0] == 2
@@ -97,13 +97,13 @@ def test_users_are_added_and_removed(tmp_path: Path, capsys: Capture, monkeypatc
     assert run(f"{CANARY} of ann", "ann")[0] == 0
     assert read_users(users)["ann"].role == "watch"
     assert run("", "op", "--remove")[0] == 0
-    code, said = run("", "op", "--remove")
-    assert (code, "there is no user op" in said) == (2, True)
+    code, message = run("", "op", "--remove")
+    assert (code, "there is no user op" in message) == (2, True)
     assert list(read_users(users)) == ["ann"]
-    code, said = run_with_password(
+    code, message = run_with_password(
         "x", "web-user", write_config(tmp_path), "op", capsys=capsys, monkeypatch=monkeypatch
     )
-    assert (code, "add users_file" in said) == (2, True)
+    assert (code, "add users_file" in message) == (2, True)
 
 
 def test_unavailable_address_is_reported(tmp_path: Path, capsys: Capture) -> None:
@@ -138,10 +138,10 @@ def test_tls_server_reveals_no_secret_and_ends_orderly(
         url = web.await_event("ready")["url"]
         assert url.startswith("https://127.0.0.1:")
         with httpx.Client(base_url=url, verify=trusting, headers=OWN, timeout=60.0) as client:
-            said = [client.get(page) for page in ("/", "/api/session", "/api/machine", "/static/app.js")]
+            message = [client.get(page) for page in ("/", "/api/session", "/api/machine", "/static/app.js")]
             login = client.post("/api/session", json={"name": "op", "password": password})
             client.headers["Authorization"] = f"Bearer {login.json()['token']}"
-            said += [
+            message += [
                 client.post("/api/session", json={"name": CANARY, "password": "wrong"}),
                 client.post("/api/session", json={"name": "op", "password": [password]}),
                 client.get(f"/api/machine?token={CANARY}"),
@@ -151,11 +151,11 @@ def test_tls_server_reveals_no_secret_and_ends_orderly(
         process = Path(f"/proc/{web.pid}")
         seen = (process / "cmdline").read_bytes() + (process / "environ").read_bytes()
         assert web.stop() == 0
-    told = "".join(answer.text for answer in said)
-    for place, text in (("answers", told), ("log", log.read_text()), ("process list", seen.decode())):
+    reported = "".join(answer.text for answer in message)
+    for place, text in (("answers", reported), ("log", log.read_text()), ("process list", seen.decode())):
         for secret in (CANARY, login.json()["token"], "PRIVATE KEY", read_users(tmp_path / "u.json")["op"].scrypt):
             assert secret not in text, (place, secret)
-    assert json.loads(said[2].text)["code"] == "AuthRequired"
+    assert json.loads(message[2].text)["code"] == "AuthRequired"
     assert "Traceback" not in log.read_text()
 
 

@@ -83,9 +83,9 @@ def _examine_all(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
     for troubles in buses.values():
         yield from troubles
     if not offline:
-        heard = {name for name, troubles in buses.items() if not any(trouble.grave for trouble in troubles)}
+        received = {name for name, troubles in buses.items() if not any(trouble.grave for trouble in troubles)}
         recorded = {trouble.place for trouble in secrets if trouble.code == storage.RECORD_BAD}
-        yield from devices.examine_devices(config, heard, recorded, print_progress)
+        yield from devices.examine_devices(config, received, recorded, print_progress)
     yield from _examine_permitted("daemon", lambda: devices.examine_daemon(config))
     yield from _examine_permitted("guard", lambda: devices.examine_guard(config))
     yield from _examine_permitted("uplink", lambda: uplink_check.examine_uplink(config, offline))

@@ -170,9 +170,9 @@ def _assess_voltage(device: DeviceDescription, profile: DriveProfile) -> Capabil
             "identified, R and L cannot"
         )
         return Capability(what, "no", why, SENSOR)
-    alike = [at for at in find_similar_names(device, "voltage") if at.fits_in_tpdo or at.may_fit_in_tpdo]
-    if alike:
-        why = f"the profile has none, but by its name {_list_names(alike)} may be one"
+    similar = [at for at in find_similar_names(device, "voltage") if at.fits_in_tpdo or at.may_fit_in_tpdo]
+    if similar:
+        why = f"the profile has none, but by its name {_list_names(similar)} may be one"
         return Capability(what, "perhaps", why, "measure its scale, and set voltage and its unit in your own profile")
     why = "no object that a TPDO can carry is a motor voltage: K, Jt and friction can be identified, R and L cannot"
     return Capability(what, "no", why, SENSOR)

@@ -133,9 +133,9 @@ def load_vendor_table(vendor: int) -> VendorTable:
     """Return the table of a vendor; plain CiA 402 for a vendor without one."""
     for file in sorted(files("fdhil.sim.drive").joinpath("vendor_drives").iterdir(), key=lambda file: file.name):
         if file.name.endswith(".toml"):
-            said = tomllib.loads(file.read_text("utf-8"))
-            if said["vendor"] == vendor:
-                return VendorTable(**{**said, "measured": tuple(said.get("measured", ()))})
+            message = tomllib.loads(file.read_text("utf-8"))
+            if message["vendor"] == vendor:
+                return VendorTable(**{**message, "measured": tuple(message.get("measured", ()))})
     return VendorTable()
 
 
@@ -218,9 +218,9 @@ class _ObjectAdapter:
 
     def _find_cyclic_setpoint(self) -> tuple[int | None, int]:
         """Return the object of cyclic set-points where it is not 0x607A, and their mode."""
-        said = self._cut.setpoint
-        if said is not None and (said["object"][0] << 8 | said["object"][1]) in self._entries:
-            return said["object"][0] << 8 | said["object"][1], said["mode"]
+        message = self._cut.setpoint
+        if message is not None and (message["object"][0] << 8 | message["object"][1]) in self._entries:
+            return message["object"][0] << 8 | message["object"][1], message["mode"]
         bits = self._entries[_MODES].default if _MODES in self._sheet.given else 1 << CYCLIC_POSITION - 1
         assert isinstance(bits, int)
         interpolated = bits >> _INTERPOLATED - 1 & 1 and not bits >> CYCLIC_POSITION - 1 & 1
@@ -311,11 +311,11 @@ class _ObjectAdapter:
         return replace(entry, default=_NO_SERVICE.get(entry.key, entry.default))
 
     def _find_vendor_signals(self, entries: Mapping[int, Entry]) -> Iterator[VendorSignal]:
-        for said in self._cut.measured:
-            index, sub = said["object"]
+        for message in self._cut.measured:
+            index, sub = message["object"]
             entry = entries.get(index << 8 | sub)
             if entry is not None:
-                yield VendorSignal(entry, said["signal"], said["per_count"], said.get("magnitude", False))
+                yield VendorSignal(entry, message["signal"], message["per_count"], message.get("magnitude", False))
 
 
 def _has_compatible_type(entry: Entry, own: Entry) -> bool:

@@ -34,15 +34,15 @@ class Step(BaseModel):
 
 def classify_axis(axis: Mapping[str, Any], troubles: list[str]) -> AxisLight:
     """Return the state of an axis: faults first, then missing data, then warnings."""
-    heard_s, last = axis.get("samples_s_ago"), axis.get("last_window")
+    received_s, last = axis.get("samples_s_ago"), axis.get("last_window")
     if axis.get("drive_state") in DRIVE_FAULTS:
         return AxisLight(
             light="bad", text=f"the drive is in state {axis['drive_state']}; read its fault code at the drive"
         )
     if troubles:
         return AxisLight(light="bad", text=troubles[0])
-    if heard_s is None or heard_s > LIVE_S:
-        ago = "no samples yet" if heard_s is None else f"no samples for {heard_s:.0f} s"
+    if received_s is None or received_s > LIVE_S:
+        ago = "no samples yet" if received_s is None else f"no samples for {received_s:.0f} s"
         return AxisLight(light="none", text=f"{ago}; switch the drive on, or check its bus")
     if axis.get("parameters") is None:
         return AxisLight(light="none", text=_explain_missing_parameters(axis))

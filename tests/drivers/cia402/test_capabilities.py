@@ -50,8 +50,8 @@ def list_capabilities(
 
 
 def test_servo_with_position_offset_can_be_corrected(tmp_path: Path) -> None:
-    told = list_capabilities(tmp_path, (*SERVO, *STOP))
-    assert {what: answer for what, (answer, _) in told.items()} == {
+    reported = list_capabilities(tmp_path, (*SERVO, *STOP))
+    assert {what: answer for what, (answer, _) in reported.items()} == {
         "listen": "yes",
         "mapping": "yes",
         "voltage": "no",
@@ -64,8 +64,8 @@ def test_servo_with_position_offset_can_be_corrected(tmp_path: Path) -> None:
         "compare other scales": "no",
         "rapid signal": "yes",
     }
-    assert "R and L cannot; wire a sensor" in told["voltage"][1]
-    assert "--set-pdos" in told["mapping"][1]
+    assert "R and L cannot; wire a sensor" in reported["voltage"][1]
+    assert "--set-pdos" in reported["mapping"][1]
 
 
 CASES: dict[str, tuple[tuple[Variable, ...], str, str, str]] = {
@@ -97,17 +97,17 @@ CASES: dict[str, tuple[tuple[Variable, ...], str, str, str]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_missing_capability_is_reported_with_its_reason(case: str, tmp_path: Path) -> None:
     variables, what, answer, says = CASES[case]
-    told = list_capabilities(tmp_path, variables)[what]
-    assert told[0] == answer
-    assert says in told[1]
+    reported = list_capabilities(tmp_path, variables)[what]
+    assert reported[0] == answer
+    assert says in reported[1]
 
 
 def test_device_that_is_not_a_drive_is_reported(tmp_path: Path) -> None:
     module = ((0x1000, 0, U32, "ro", 0, 0x00070191), (0x6000, 1, 5, "ro", 1, None))
-    told = list_capabilities(tmp_path, module)
-    assert list(told) == ["listen"]
-    assert told["listen"][0] == "no"
-    assert "profile 401" in told["listen"][1]
+    reported = list_capabilities(tmp_path, module)
+    assert list(reported) == ["listen"]
+    assert reported["listen"][0] == "no"
+    assert "profile 401" in reported["listen"][1]
 
 
 @pytest.mark.parametrize(
@@ -134,9 +134,9 @@ def test_vendors_profile_is_suggested(
 
 
 def test_duty_object_counts_as_voltage_with_caveat(tmp_path: Path) -> None:
-    told = list_capabilities(tmp_path, (*COMMON, *OFFSETS, *MAXON, *build_pdo_objects()), "epos4")["voltage"]
-    assert told[0] == "yes"
-    assert "3203:01 (duty) times drive.dc_link_v" in told[1]
+    reported = list_capabilities(tmp_path, (*COMMON, *OFFSETS, *MAXON, *build_pdo_objects()), "epos4")["voltage"]
+    assert reported[0] == "yes"
+    assert "3203:01 (duty) times drive.dc_link_v" in reported[1]
 
 
 def test_vendor_objects_are_found_by_name(tmp_path: Path) -> None:
@@ -157,11 +157,11 @@ def test_eds_command_prints_text_and_json(tmp_path: Path, capsys: Any) -> None:
     ):
         assert words in " ".join(out.split())
     code, out, _ = fdhil("eds", path, "--profile", "epos4", "--json", capsys=capsys)
-    said = json.loads(out)
+    message = json.loads(out)
     assert code == 1  # its current is not where an EPOS4 has it
-    assert (said["schema"], said["profile"], said["suggested_profile"]) == ("fdhil-eds-1", "epos4", "cia402")
-    assert said["abilities"][0]["what"] == "listen"
-    assert said["device"]["is_drive"] is True
+    assert (message["schema"], message["profile"], message["suggested_profile"]) == ("fdhil-eds-1", "epos4", "cia402")
+    assert message["abilities"][0]["what"] == "listen"
+    assert message["device"]["is_drive"] is True
 
 
 def test_unknown_profile_exits_with_2(tmp_path: Path, capsys: Any) -> None:

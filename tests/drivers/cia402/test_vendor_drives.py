@@ -105,8 +105,8 @@ def test_two_axes_can_share_a_node_but_not_its_pdos() -> None:
 def test_unsigned_duty_gets_the_sign_of_the_motor_equation() -> None:
     """A braking EPOS4: the current opposes the speed, the voltage follows R i + K w."""
     config = build_machine_config(drive={"profile": "epos4", "dc_link_v": 48.0}, voltage={"sampling": "instant"})
-    told = {(0x606C, 0): -1000, (0x30D1, 2): 12_000, (0x3203, 1): 250}
-    got = decode_frames(config, lambda key, _k: told.get(key, 0))
+    reported = {(0x606C, 0): -1000, (0x30D1, 2): 12_000, (0x3203, 1): 250}
+    got = decode_frames(config, lambda key, _k: reported.get(key, 0))
     assert got.voltage_v is not None
     np.testing.assert_allclose(got.speed_rad_s, -1000 * 2 * math.pi / 60)
     np.testing.assert_allclose(got.current_a, 12.0)

@@ -85,9 +85,9 @@ class MtConnectPeer:
         held: dict[str, list[str]] = {"Samples": [], "Events": []}
         for sequence, item, text, at_s in new:
             holder, element, sub_type = ITEMS[item]
-            told = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(at_s)) + f".{int(at_s % 1 * 1e6):06d}Z"
+            reported = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(at_s)) + f".{int(at_s % 1 * 1e6):06d}Z"
             sub = f' subType="{sub_type}"' if sub_type else ""
-            begin = f'<{element} dataItemId="{item}" sequence="{sequence}" timestamp="{told}"{sub}>'
+            begin = f'<{element} dataItemId="{item}" sequence="{sequence}" timestamp="{reported}"{sub}>'
             held[holder].append(f"{begin}{escape(text)}</{element}>")
         inside = "".join(f"<{holder}>{''.join(each)}</{holder}>" for holder, each in held.items() if each)
         return (

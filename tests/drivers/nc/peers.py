@@ -69,8 +69,8 @@ class BridgePeer:
             writer.write(json.dumps({"schema": "fdhil-linuxcnc-1", "servo_period_s": 0.001}).encode() + b"\n")
             while not writer.is_closing():
                 now_ns = time.monotonic_ns()
-                told = {"stamp_ns": now_ns, "error_ns": 2_000_000, "cycle": now_ns // 1_000_000, "mm": {"X": 0.0}}
-                line = b"GET / HTTP/1.1" if self._nonsense else json.dumps({**told, **self._now}).encode()
+                reported = {"stamp_ns": now_ns, "error_ns": 2_000_000, "cycle": now_ns // 1_000_000, "mm": {"X": 0.0}}
+                line = b"GET / HTTP/1.1" if self._nonsense else json.dumps({**reported, **self._now}).encode()
                 writer.write(line + b"\n")
                 await writer.drain()
                 await asyncio.sleep(self.period_s)

@@ -133,16 +133,16 @@ def list_true_edges(told: MoveSequence, lag: int) -> list[tuple[MoveKind, int]]:
 
 @pytest.mark.parametrize("lag", [0, 3, 40, 700])
 def test_reported_set_points_align_exactly_despite_bus_delay(lag: int) -> None:
-    told = build_sequence(PROGRAM)
-    found = [e for e in list_edges(detect_moves(told, report_every_cycle(told, 0), lag)) if e[0] is not REST]
-    true = [e for e in list_true_edges(told, lag) if e[0] is not REST]
+    reported = build_sequence(PROGRAM)
+    found = [e for e in list_edges(detect_moves(reported, report_every_cycle(reported, 0), lag)) if e[0] is not REST]
+    true = [e for e in list_true_edges(reported, lag) if e[0] is not REST]
     assert [kind for kind, _ in found] == [kind for kind, _ in true]
     np.testing.assert_allclose([tick for _, tick in found], [tick for _, tick in true], atol=1)
 
 
 def test_line_program_and_override_come_with_the_move() -> None:
-    told = build_sequence(PROGRAM)
-    rapids = [e for e in detect_moves(told, report_every_cycle(told, 0), 3) if e.kind is RAPID]
+    reported = build_sequence(PROGRAM)
+    rapids = [e for e in detect_moves(reported, report_every_cycle(reported, 0), 3) if e.kind is RAPID]
     assert [e.nc and (e.nc.line, e.nc.program, e.nc.override, e.nc.held) for e in rapids] == [
         (1, "part.ngc", (1.0, 1.0), False), (3, "part.ngc", (1.0, 1.0), False),
     ]  # fmt: skip
@@ -151,83 +151,84 @@ def test_line_program_and_override_come_with_the_move() -> None:
 @pytest.mark.parametrize("period", [20, 50, 100])
 @pytest.mark.parametrize("late", [0, 7])
 def test_rarely_polled_source_gives_the_edges_of_the_demand(period: int, late: int) -> None:
-    told = build_sequence([rest(500), rapid(300), rest(300), feed(60), rest(300), rapid(-360, 3), rest(500)])
-    found = list_edges(detect_moves(told, report_polled(told, late * MS, period), 0))
+    reported = build_sequence([rest(500), rapid(300), rest(300), feed(60), rest(300), rapid(-360, 3), rest(500)])
+    found = list_edges(detect_moves(reported, report_polled(reported, late * MS, period), 0))
     assert [kind for kind, _ in found] == [RAPID, REST, FEED, REST, RAPID, REST]
-    np.testing.assert_allclose([tick for _, tick in found], [tick for _, tick in list_true_edges(told, 0)], atol=2)
+    np.testing.assert_allclose([tick for _, tick in found], [tick for _, tick in list_true_edges(reported, 0)], atol=2)
 
 
 def test_immediate_return_move_has_its_own_line() -> None:
-    told = build_sequence([rest(300), rapid(200, 7), rapid(-200, 8), rest(400)])
-    events = detect_moves(told, report_every_cycle(told, 0), 3)
+    reported = build_sequence([rest(300), rapid(200, 7), rapid(-200, 8), rest(400)])
+    events = detect_moves(reported, report_every_cycle(reported, 0), 3)
     assert [(e.kind, e.nc and e.nc.line) for e in events] == [(RAPID, 7), (REST, None), (RAPID, 8), (REST, None)]
 
 
 def test_hold_and_override_within_a_move_are_reported() -> None:
-    told = build_sequence([rest(300), rapid(400), rest(400)])
-    states = report_every_cycle(told, 0)
+    reported = build_sequence([rest(300), rapid(400), rest(400)])
+    states = report_every_cycle(reported, 0)
     slow = [replace(s, rapid_override=0.5) if 500 < s.stamp_ns / MS < 520 else s for s in states]
     held = [replace(s, feed_hold=True) if 500 < s.stamp_ns / MS < 520 else s for s in states]
-    for said, override, hold in ((slow, (0.5, 1.0), False), (held, (1.0, 1.0), True)):
-        (move, _) = detect_moves(told, said, 3)
+    for message, override, hold in ((slow, (0.5, 1.0), False), (held, (1.0, 1.0), True)):
+        (move, _) = detect_moves(reported, message, 3)
         assert move.nc is not None
         assert (move.nc.override, move.nc.held) == (override, hold)
 
 
 def test_rapid_resumed_after_a_hold_is_not_used() -> None:
-    told = build_sequence(
+    reported = build_sequence(
         [rest(300), rapid(200), Part(HOLD, 1, np.zeros(30)), rapid(200), rest(300), rapid(-400, 2), rest(400)]
     )
-    rapids = [e.nc and e.nc.held for e in detect_moves(told, report_every_cycle(told, 0), 3) if e.kind is RAPID]
+    rapids = [e.nc and e.nc.held for e in detect_moves(reported, report_every_cycle(reported, 0), 3) if e.kind is RAPID]
     assert rapids == [False, True, False]
 
 
 def test_override_set_before_the_move_applies() -> None:
-    told = build_sequence([rest(1000), rapid(400), rest(400)])
+    reported = build_sequence([rest(1000), rapid(400), rest(400)])
     states = [
         NcState(100 * MS, MS, REST, rapid_override=0.8),
         NcState(1200 * MS, MS, RAPID),
         NcState(2300 * MS, MS, REST),
     ]
-    (move, _) = detect_moves(told, states, 0)
+    (move, _) = detect_moves(reported, states, 0)
     assert move.kind is RAPID
     assert move.nc is not None
     assert move.nc.override == (0.8, 0.8)
 
 
 def test_silent_nc_reports_no_rapid() -> None:
-    told = build_sequence([rest(300), rapid(400), rest(4000)])
-    assert list_edges(detect_moves(told, [], 0)) == [(UNKNOWN, 299), (REST, pytest.approx(1224, abs=2))]
+    reported = build_sequence([rest(300), rapid(400), rest(4000)])
+    assert list_edges(detect_moves(reported, [], 0)) == [(UNKNOWN, 299), (REST, pytest.approx(1224, abs=2))]
     lost = [
-        s if s.stamp_ns < 500 * MS else replace(s, motion=UNKNOWN, demand_mm=None) for s in report_every_cycle(told, 0)
+        s if s.stamp_ns < 500 * MS else replace(s, motion=UNKNOWN, demand_mm=None)
+        for s in report_every_cycle(reported, 0)
     ]
-    assert UNKNOWN in [kind for kind, _ in list_edges(detect_moves(told, lost, 0))]
+    assert UNKNOWN in [kind for kind, _ in list_edges(detect_moves(reported, lost, 0))]
 
 
 def test_set_points_that_differ_from_the_bus_are_not_aligned() -> None:
     """A bridge of another machine or axis: its clocks would fit, but its messages are not about this axis."""
-    told, other = (
+    reported, other = (
         build_sequence([rest(300), rapid(400), rest(4000)]),
         build_sequence([rest(300), rapid(350), rest(4050)]),
     )
-    assert RAPID not in [kind for kind, _ in list_edges(detect_moves(told, report_every_cycle(other, 0), 0))]
+    assert RAPID not in [kind for kind, _ in list_edges(detect_moves(reported, report_every_cycle(other, 0), 0))]
 
 
 def test_restarted_nc_is_aligned_again() -> None:
-    told = build_sequence([rest(300), rapid(400), rest(800)])
+    reported = build_sequence([rest(300), rapid(400), rest(800)])
     source = NcReportedMoves("X", build_machine_config(g0={"source": "linuxcnc"}))
-    once = detect_moves(told, report_every_cycle(told, 0), 3, source)
-    length = len(told.kind) + 3 + 500
-    again = detect_moves(told, report_every_cycle(told, length * MS, first_cycle=10), 5, source, first=length)
+    once = detect_moves(reported, report_every_cycle(reported, 0), 3, source)
+    length = len(reported.kind) + 3 + 500
+    again = detect_moves(reported, report_every_cycle(reported, length * MS, first_cycle=10), 5, source, first=length)
     rapids = [e.tick for e in once + again if e.kind is RAPID]  # the bus has jumped meanwhile: that is none
     assert rapids == pytest.approx([302, length + 304], abs=1)
 
 
 def test_restarted_sync_count_discards_former_states() -> None:
-    told = build_sequence([rest(300), rapid(400), rest(800)])
+    reported = build_sequence([rest(300), rapid(400), rest(800)])
     source = NcReportedMoves("X", build_machine_config(g0={"source": "linuxcnc"}))
-    detect_moves(told, report_every_cycle(told, 0), 3, source)
-    assert [e.kind for e in detect_moves(told, report_every_cycle(told, 0, first_cycle=90_000), 3, source)] == [
+    detect_moves(reported, report_every_cycle(reported, 0), 3, source)
+    assert [e.kind for e in detect_moves(reported, report_every_cycle(reported, 0, first_cycle=90_000), 3, source)] == [
         RAPID,
         REST,
     ]
@@ -236,14 +237,16 @@ def test_restarted_sync_count_discards_former_states() -> None:
 @settings(deadline=None, max_examples=8)
 @given(block=st.integers(7, 400), lag=st.integers(0, 30))
 def test_moves_are_independent_of_block_size(block: int, lag: int) -> None:
-    told = build_sequence(PROGRAM)
-    states = report_every_cycle(told, 0)
-    assert list_edges(detect_moves(told, states, lag, block=block)) == list_edges(detect_moves(told, states, lag))
+    reported = build_sequence(PROGRAM)
+    states = report_every_cycle(reported, 0)
+    assert list_edges(detect_moves(reported, states, lag, block=block)) == list_edges(
+        detect_moves(reported, states, lag)
+    )
 
 
 def test_state_with_future_time_stamp_does_not_block_others() -> None:
-    told = build_sequence(PROGRAM)
-    states = report_every_cycle(told, 20 * MS)
+    reported = build_sequence(PROGRAM)
+    states = report_every_cycle(reported, 20 * MS)
     source = NcReportedMoves("X", build_machine_config(g0={"source": "linuxcnc"}))
     source.detect_moves(replace(states[0], stamp_ns=4 * 10**17))
-    assert list_edges(detect_moves(told, states, 20, source)) == list_edges(detect_moves(told, states, 20))
+    assert list_edges(detect_moves(reported, states, 20, source)) == list_edges(detect_moves(reported, states, 20))

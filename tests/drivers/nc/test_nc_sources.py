@@ -44,11 +44,11 @@ async def test_source_reports_what_its_interface_shows(name: str) -> None:
         source = load_nc_source(name)(build_config(name, peer))
         async with source:
             for kind in sorted(peer.knows, key=lambda kind: kind.value):
-                told = {key: value for key, value in SAID.items() if key in peer.tells}
-                await peer.set_state(kind, **told)
+                reported = {key: value for key, value in SAID.items() if key in peer.tells}
+                await peer.set_state(kind, **reported)
                 state = await read_until(source, lambda state, kind=kind: state.motion is kind)  # type: ignore[misc]
                 state = await read_until(source, lambda state, kind=kind: state.motion is kind)  # type: ignore[misc]
-                assert {key: getattr(state, key) for key in told} == pytest.approx(told)
+                assert {key: getattr(state, key) for key in reported} == pytest.approx(reported)
                 assert state.error_ns > 0
 
 
@@ -84,15 +84,15 @@ async def _assert_only_unknown_states(source: NcSource) -> None:
 
 
 async def test_lost_nc_is_reported_once_and_unknown_until_it_returns(name: str) -> None:
-    told: asyncio.Queue[NcState | Notice] = asyncio.Queue()
+    reported: asyncio.Queue[NcState | Notice] = asyncio.Queue()
     async with PEERS[name]() as peer:
         await peer.set_state(MoveKind.RAPID if MoveKind.RAPID in peer.knows else MoveKind.REST)
-        listening = asyncio.create_task(NcListener(build_config(name, peer, silence_s=0.5)).run(told.put_nowait))
-        assert isinstance(await told.get(), NcState)
+        listening = asyncio.create_task(NcListener(build_config(name, peer, silence_s=0.5)).run(reported.put_nowait))
+        assert isinstance(await reported.get(), NcState)
     async with asyncio.timeout(300):
-        while not isinstance(lost := await told.get(), NcState) or lost.motion is not MoveKind.UNKNOWN:
+        while not isinstance(lost := await reported.get(), NcState) or lost.motion is not MoveKind.UNKNOWN:
             pass
-        notice = await told.get()
+        notice = await reported.get()
     listening.cancel()
     await asyncio.gather(listening, return_exceptions=True)
     assert isinstance(notice, Notice)

@@ -37,10 +37,10 @@ def poll_states(
 @given(st.integers(0, 99), st.integers(0, 99), st.integers(1, 20), st.integers(0, 4))
 def test_slow_polling_keeps_kinds_right_and_edges_exact(phase: int, age: int, answer: int, lag: int) -> None:
     """Rapids of 0.3 s: longer than the period, the update and the answer together."""
-    told = build_sequence((rest(300), rapid(90), rest(50), feed(30), rest(50), rapid(-90, 3), rest(400)))
-    events = detect_moves(told, list(poll_states(told, phase, age, answer)), lag)
+    reported = build_sequence((rest(300), rapid(90), rest(50), feed(30), rest(50), rapid(-90, 3), rest(400)))
+    events = detect_moves(reported, list(poll_states(reported, phase, age, answer)), lag)
     moves = [(event.kind, event.tick) for event in events]
-    wanted = [(kind, cycle + lag) for cycle, kind in told.edges if cycle]
+    wanted = [(kind, cycle + lag) for cycle, kind in reported.edges if cycle]
     assert [kind for kind, _ in moves] == [kind for kind, _ in wanted]
     assert [tick for _, tick in moves] == pytest.approx([tick for _, tick in wanted], abs=2)
 
@@ -49,12 +49,12 @@ def test_slow_polling_keeps_kinds_right_and_edges_exact(phase: int, age: int, an
 @given(st.integers(0, 99), st.integers(0, 99), st.integers(1, 60))
 def test_slow_polling_never_reports_a_feed_as_rapid(phase: int, age: int, answer: int) -> None:
     """The program has moves without a rest between them, and shorter ones than the source can resolve."""
-    told = build_sequence(PROGRAM)
-    events = detect_moves(told, list(poll_states(told, phase, age, answer)), 0)
-    rapids = [False] * len(told.kind)
+    reported = build_sequence(PROGRAM)
+    events = detect_moves(reported, list(poll_states(reported, phase, age, answer)), 0)
+    rapids = [False] * len(reported.kind)
     for event, after in zip(events, [*events[1:], None], strict=True):
         if event.kind is MoveKind.RAPID:
-            end = after.tick if after else len(told.kind)
+            end = after.tick if after else len(reported.kind)
             rapids[event.tick + 10 : end - 10] = [True] * max(0, end - event.tick - 20)
-    wrong = [k for k, kind in enumerate(told.kind) if rapids[k] and kind in (MoveKind.FEED, MoveKind.ARC)]
+    wrong = [k for k, kind in enumerate(reported.kind) if rapids[k] and kind in (MoveKind.FEED, MoveKind.ARC)]
     assert not wrong

@@ -58,11 +58,11 @@ _IDS = (*_SENDING.listener.list_received_ids(), COB_SYNC, 0x7E5, 0x000)
 def _copy_guard() -> Bench:
     """Return a copy of the bench in the middle of a cut; constant parts are shared."""
     made = copy.copy(_SENDING)
-    made.listener, heard = FrameMonitor(made.settings), made.listener
-    for mine, theirs in zip(made.listener._pdos.values(), heard._pdos.values(), strict=True):
+    made.listener, received = FrameMonitor(made.settings), made.listener
+    for mine, theirs in zip(made.listener._pdos.values(), received._pdos.values(), strict=True):
         vars(mine).update(vars(theirs))
-    made.listener._nodes = [copy.copy(node) for node in heard._nodes]
-    made.listener._counter, made.listener._last_sync_s = heard._counter, heard._last_sync_s
+    made.listener._nodes = [copy.copy(node) for node in received._nodes]
+    made.listener._counter, made.listener._last_sync_s = received._counter, received._last_sync_s
     made.drives = [replace(drive, queue=list(drive.queue)) for drive in made.drives]
     made.frames, made.held, made.heartbeats, made.alarms, made.outputs = [], [], [], [], made.outputs[-1:]
     return made

@@ -65,7 +65,7 @@ def _read_all(module: Any, asked: Connection, others: Connection) -> None:
     for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
         signal.signal(number, signal.SIG_DFL)  # the fuzzer has its own handlers
     faulthandler.disable()
-    told = os.fdopen(os.dup(2), "w")
+    reported = os.fdopen(os.dup(2), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries report damage there
     module.library()
     while True:
@@ -76,8 +76,8 @@ def _read_all(module: Any, asked: Connection, others: Connection) -> None:
         try:
             reading_process.send_table(asked, module, content, "r", reading_process.LONGEST_S)
         except BaseException:  # noqa: BLE001 - whatever is not declared is what is looked for
-            traceback.print_exc(file=told)
-            told.flush()
+            traceback.print_exc(file=reported)
+            reported.flush()
             sys.exit(RAISED)
 
 

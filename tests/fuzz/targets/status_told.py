@@ -24,21 +24,21 @@ BORN.node.build_births(*BORN._make_metrics(BEFORE), NOW_MS)
 
 def taste(data: bytes) -> None:
     """Use the bytes, a JSON list or texts separated by zero bytes, for all values that come from outside."""
-    told = _publish_values(data)
-    text, number = [str(item) for item in told[:4]], [x for x in told if type(x) in (int, float)]
-    said = status(
+    reported = _publish_values(data)
+    text, number = [str(item) for item in reported[:4]], [x for x in reported if type(x) in (int, float)]
+    message = status(
         "X",
         troubles=[trouble("StoreFault", "X", text=text[1])],
         notices=[noticed("Armed", 5.0, text=text[3])],
         armed={"program": text[0], "method": text[1]},
         may_stand={"nothing": False, "text": text[2]},
     )
-    said["nc"] |= {
+    message["nc"] |= {
         "program": text[3],
         "line": number[0] if number else None,
         "feed_mm_min": number[-1] if number else 1,
     }
-    news = copy.copy(HEARD).build_update(json.loads(json.dumps(said)), NOW_MS)
+    news = copy.copy(HEARD).build_update(json.loads(json.dumps(message)), NOW_MS)
     for line in [*list_changed_lines(SHOWN, build_adapter_state(news)), *map(format_notice, news.events)]:
         assert line.count("|") >= 2
         assert line.isprintable(), line

@@ -25,9 +25,9 @@ DIALECTS = [
 def taste(data: bytes) -> None:
     """Read the bytes by a map with all columns in the file, or only the names."""
     for dialect in (DIALECTS[0], DIALECTS[3]):
-        told = ColumnMap.model_validate(make_column_map(dialect))
+        reported = ColumnMap.model_validate(make_column_map(dialect))
         try:
-            make_recording(apply_column_map(parse_trace(data, told.text, "r"), told, "r"), "r")
+            make_recording(apply_column_map(parse_trace(data, reported.text, "r"), reported, "r"), "r")
         except RecordingError as error:
             assert len(str(error)) < 2000
 

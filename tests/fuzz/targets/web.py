@@ -81,8 +81,8 @@ async def _send_request(data: bytes) -> None:
     status = answers[0]["status"]
     assert status in DECLARED, (status, b"".join(m.get("body", b"") for m in answers)[:500])
     if status >= 400 and scope["path"].startswith("/api/") and scope["method"] != "HEAD":
-        told = json.loads(b"".join(message.get("body", b"") for message in answers[1:]))
-        assert told["code"], told
+        reported = json.loads(b"".join(message.get("body", b"") for message in answers[1:]))
+        assert reported["code"], reported
 
 
 def taste(data: bytes) -> None:
