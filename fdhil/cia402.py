@@ -105,7 +105,7 @@ LOGICAL_AXES = range(1, 9)
 def get_first_axis_index(index: int) -> int:
     """Return the index of the same object on the first axis of its device.
 
-    >>> hex(first_axis_index(0x68B0))
+    >>> hex(get_first_axis_index(0x68B0))
     '0x60b0'
     """
     return 0x6000 + (index - 0x6000) % LOGICAL_AXIS_STEP if 0x6000 <= index < 0xA000 else index
@@ -161,7 +161,7 @@ _TOWARD_ENABLED = {
 def decode_power_state(statusword: int) -> PowerState:
     """Return the power state that a 16 bit ``statusword`` shows.
 
-    >>> state_of(0x1237).value
+    >>> decode_power_state(0x1237).value
     'Operation enabled'
     """
     for mask, value, state in STATUS_PATTERN:
@@ -297,7 +297,7 @@ _EMCY_TEXT = {
 def describe_emergency(code: int) -> str:
     """Return what an EMCY code means (CiA 301, table 26).
 
-    >>> emcy_text(0x8611)
+    >>> describe_emergency(0x8611)
     'following error'
     """
     if code in _EMCY_TEXT:

@@ -134,7 +134,8 @@ def _describe_fleets(figures: Figures) -> list[str]:
         *pages.wrap_paragraph(
             f"""{_describe_when(calm)}
             Processor time of a record, in µs, with {calm["machines"]} machines and {calm["records"]} records
-            through two collectors, starting all of them included: {reported}. That of the uplinks is spent on the machines,
+            through two collectors, starting all of them included: {reported}. That of the uplinks is spent on the
+            machines,
             each its own. It is the processor's time, not the clock's, so that other work on the same computer counts
             little."""
         ),

@@ -166,7 +166,8 @@ def _describe_sampling(found: Sequence[Mapping[str, Any]]) -> str:
         words.append(f"{sampling.replace('_', ' ')}s at most {', '.join(most)} %")
     shares = [(share, name, told) for told in found for share, name in _compute_shares(told)]
     share, name, reported = min(shares, key=lambda one: one[0])
-    place = f"{reported['sampling'].replace('_', ' ')}s at {1 / reported['period_s']:g} Hz and {100 * reported['noise']:g} % noise"
+    sampling, rate_hz = reported["sampling"].replace("_", " "), 1 / reported["period_s"]
+    place = f"{sampling}s at {rate_hz:g} Hz and {100 * reported['noise']:g} % noise"
     return f"""RMS errors: {"; ".join(words)}. Of all 95 % intervals that of {name} holds the truth least often:
         {100 * share:.0f} % ({place})."""
 

@@ -136,7 +136,8 @@ def evaluate_goals(promised: Mapping[str, Mapping[str, int]], frames: list[list[
     )
     stale = promised.get(SDO, {}).get("late", 0)
     lost, reported, sent = (sum(seen.get(key, 0) for _, _, seen in frames) for key in ("lost", "reported", "frames"))
-    told_of = f"{wrong} of {late - stale:,} stale and {corrupted:,} wrong Modbus answers and {stale:,} stale SDO answers taken"
+    modbus = f"{wrong} of {late - stale:,} stale and {corrupted:,} wrong Modbus answers"
+    told_of = f"{modbus} and {stale:,} stale SDO answers taken"
     exact = all(seen.get("lost", 0) == seen.get("reported", 0) and not seen.get("misplaced") for _, _, seen in frames)
     return {
         "R8": {"met": wrong == 0, "figure": told_of},

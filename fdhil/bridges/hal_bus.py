@@ -158,7 +158,7 @@ def encode_cycle(cycle: int, axes: Sequence[Axis], samples: Sequence[Sample]) ->
 def get_sync_counter(cycle: int) -> int:
     """Return the counter byte of a cycle's SYNC.
 
-    >>> counter_of(0), counter_of(239), counter_of(240)
+    >>> get_sync_counter(0), get_sync_counter(239), get_sync_counter(240)
     (1, 240, 1)
     """
     return cycle % SYNC_RANGE + 1

@@ -12,7 +12,7 @@ _REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
 def replace_controls(text: str) -> str:
     """Return text with each control or direction character, except newline and tab, replaced by a mark.
 
-    >>> without_controls("axis \\x1b[2J X\\n") == "axis \\N{REPLACEMENT CHARACTER}[2J X\\n"
+    >>> replace_controls("axis \\x1b[2J X\\n") == "axis \\N{REPLACEMENT CHARACTER}[2J X\\n"
     True
     """
     if text.isprintable():

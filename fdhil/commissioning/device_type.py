@@ -20,7 +20,7 @@ def is_cia402_drive(device_type: int | None) -> bool:
 def describe_device_type(device_type: int | None) -> str:
     """Return the device profile in words.
 
-    >>> describe(0x00030191)
+    >>> describe_device_type(0x00030191)
     'CiA 401, an I/O module'
     """
     number = (device_type or 0) & 0xFFFF

@@ -54,7 +54,7 @@ def extract_cob_id(cob_id: int) -> int:
 
     Bit 30 has no meaning for an RPDO (CiA 301, 7.5.2.35); drives may set it or not.
 
-    >>> f"{identifier_of(0xC000_0205):X} {identifier_of(0x2000_0205):X}"
+    >>> f"{extract_cob_id(0xC000_0205):X} {extract_cob_id(0x2000_0205):X}"
     '205 20000205'
     """
     return cob_id & (EXTENDED | EXTENDED - 1 if cob_id & EXTENDED else 0x7FF)

@@ -205,7 +205,7 @@ def find_best_description(
 def replace_unprintable(data: bytes) -> str:
     r"""Return a drive's text with every character that could control a terminal shown as ``?``.
 
-    >>> printable(b"axis\\x1b[2J\\0")
+    >>> replace_unprintable(b"axis\\x1b[2J\\0")
     'axis?[2J'
     """
     text = data.rstrip(b"\0").decode("utf-8", "replace")[:80]

@@ -30,7 +30,7 @@ _NODE_FUNCTIONS = (0x080, 0x180, 0x280, 0x380, 0x480, COB_SDO_RESPONSE, COB_HEAR
 def classify_master_frame(can_id: int) -> str | None:
     """Return what a frame with this COB-ID, flags included, shows that only a master sends; None if a node may send it.
 
-    >>> shows_master(0x205)
+    >>> classify_master_frame(0x205)
     'set-points'
     """
     if can_id & ~0x7FF == REMOTE_FLAG:

@@ -32,7 +32,7 @@ PARAMETER_MEANINGS: Mapping[str, str] = {
 def format_minute(time: str) -> str:
     """Format a time of JSON (ISO 8601, UTC) to the minute, with its time zone.
 
-    >>> minute("2026-11-28T01:15:09+00:00")
+    >>> format_minute("2026-11-28T01:15:09+00:00")
     '2026-11-28 01:15 UTC'
     """
     return f"{time[:16].replace('T', ' ')} UTC"

@@ -102,14 +102,19 @@ def promise_motion(axis: Axis, monkeypatch: pytest.MonkeyPatch) -> None:
         (passes,) = integers(f"passes_{next(numbers)}")
         return None if passes == 1 else "OffsetRate"
 
-    for name, promise in {"follow": move, "brake": move, "violation": violation}.items():
+    for name, promise in {
+        "move_toward_goal": move,
+        "decelerate_offset": move,
+        "find_limit_violation": violation,
+    }.items():
         monkeypatch.setattr(guard_step, name, promise)
 
 
 def frames_leave(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
     """From a safe state inside the ceiling a frame always leaves, and the state that it leaves is safe.
 
-    ``follow``, ``brake`` and ``violation`` stand for what ``test_theorem_about_motion_is_proven`` proves of them.
+    ``move_toward_goal``, ``decelerate_offset`` and ``find_limit_violation`` are replaced by what
+    ``test_theorem_about_motion_is_proven`` proves of them.
     """
     made = Core(mode, monkeypatch)
     promise_motion(made.axis, monkeypatch)

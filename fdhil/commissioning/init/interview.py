@@ -59,7 +59,7 @@ def settle_machine(draft: ConfigDraft, buses: Sequence[FoundBus], name: str, nc:
 def _round_cycle_s(measured_s: float) -> float:
     """Return the period to which an NC is set, a multiple of a quarter of a millisecond, if one is near.
 
-    >>> _cycle(0.000993), _cycle(0.0011)
+    >>> _round_cycle_s(0.000993), _round_cycle_s(0.0011)
     (0.001, 0.0011)
     """
     usual_s = max(1, round(measured_s / 0.00025)) * 0.00025

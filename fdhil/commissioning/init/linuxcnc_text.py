@@ -46,7 +46,7 @@ class Ini:
 def parse_finite(text: str) -> float | None:
     """Return the first word of a text as a finite number; None if it is not one.
 
-    >>> finite("20.0  # mm"), finite("fast"), finite("nan")
+    >>> parse_finite("20.0  # mm"), parse_finite("fast"), parse_finite("nan")
     (20.0, None, None)
     """
     try:

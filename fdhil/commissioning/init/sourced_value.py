@@ -16,7 +16,7 @@ class SourcedValue:
 def round_to_six_digits(value: float) -> float:
     """Return a number with six significant digits.
 
-    >>> rounded(0.1 + 0.2)
+    >>> round_to_six_digits(0.1 + 0.2)
     0.3
     """
     return float(f"{value:.6g}")

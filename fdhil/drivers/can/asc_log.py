@@ -50,7 +50,7 @@ _REMOTE, _FD, _RATE_SWITCH, _ERROR_STATE = 1 << 4, 1 << 12, 1 << 13, 1 << 14  # 
 def parse_date_ns(text: str) -> int | None:
     """Parse a header's date, local time, into ns since 1970; None where it is invalid.
 
-    >>> date_ns("Wed May  1 10:00:00 2024") == date_ns("Mit Mai 1 10:00:00.000 am 2024")
+    >>> parse_date_ns("Wed May  1 10:00:00 2024") == parse_date_ns("Mit Mai 1 10:00:00.000 am 2024")
     True
     """
     match = _DATE.match(text)

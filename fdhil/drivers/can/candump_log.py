@@ -65,7 +65,7 @@ def format_frame(frame: LoggedFrame, header: LogHeader) -> str:
 def format_id(can_id: int) -> str:
     """Format an identifier with the flags of SocketCAN as candump does.
 
-    >>> shown_id(0x181), shown_id(REMOTE_FLAG | 0x701), shown_id(EXTENDED_FLAG | 0x123), shown_id(ERROR_FLAG | 4)
+    >>> format_id(0x181), format_id(REMOTE_FLAG | 0x701), format_id(EXTENDED_FLAG | 0x123), format_id(ERROR_FLAG | 4)
     ('181', '701', '00000123', '20000004')
     """
     if can_id & ERROR_FLAG:

@@ -83,8 +83,8 @@ _OF_CONTROLLER: tuple[tuple[int, str, Severity, str], ...] = (
 def translate_error_frames(frames: Frames) -> list[Notice]:
     """Translate error frames into notices, each code at most once per block.
 
-    >>> from fdhil.drivers.can.frame_ring import frames_of
-    >>> [n.code for n in error_notices(frames_of([(0, ERROR_FLAG | ERROR_BUS_OFF, bytes(8))]))]
+    >>> from fdhil.drivers.can.frame_ring import pack_frames
+    >>> [n.code for n in translate_error_frames(pack_frames([(0, ERROR_FLAG | ERROR_BUS_OFF, bytes(8))]))]
     ['BusOff']
     """
     errors = frames[frames["id"] & ERROR_FLAG != 0]

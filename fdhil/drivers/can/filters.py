@@ -15,7 +15,7 @@ def build_drive_filters(node_ids: Iterable[int], cob_ids: Iterable[int]) -> list
     """Return filters for NMT, SYNC and TIME, for the whole predefined connection set of these nodes (SDO and EMCY
     included, for the black box), and for ``cob_ids``.
 
-    >>> [(hex(wanted), hex(mask)) for wanted, mask in drive_filters([5], [0x185, 0x33])]
+    >>> [(hex(wanted), hex(mask)) for wanted, mask in build_drive_filters([5], [0x185, 0x33])]
     [('0x0', '0x8000007f'), ('0x5', '0x8000007f'), ('0x33', '0x800007ff')]
     """
     nodes = sorted({0, *node_ids})

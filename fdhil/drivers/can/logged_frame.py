@@ -86,7 +86,7 @@ class LogHeader:
 def assign_bus_numbers(names: Iterable[str]) -> dict[str, int]:
     """Number the buses from 1: ``can0`` is 1, as in can-utils; other names get the free numbers.
 
-    >>> number_buses(["vcan0", "can1", "can0"])
+    >>> assign_bus_numbers(["vcan0", "can1", "can0"])
     {'can1': 2, 'can0': 1, 'vcan0': 3}
     """
     numbers, others = {}, []
@@ -146,7 +146,7 @@ def read_lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
 def parse_decimal_ns(seconds: str) -> int:
     """Convert a decimal number of seconds to ns, exactly.
 
-    >>> decimal_ns("1714557600.249713")
+    >>> parse_decimal_ns("1714557600.249713")
     1714557600249713000
     """
     whole, _, fraction = seconds.partition(".")

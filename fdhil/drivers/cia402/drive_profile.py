@@ -175,7 +175,7 @@ class DriveProfile:
 def decode_speed_unit(word: int | None) -> SpeedUnit | None:
     """Decode the unit in 0x60A9: prefix, numerator and denominator of CiA 303-2; None for any other.
 
-    >>> speed_unit_of(0x00B44700), speed_unit_of(0xFDB44700), speed_unit_of(0x00B50300)
+    >>> decode_speed_unit(0x00B44700), decode_speed_unit(0xFDB44700), decode_speed_unit(0x00B50300)
     ('rpm', 'millirpm', 'increments_per_s')
     """
     units: dict[int | None, SpeedUnit] = {0x00B44700: "rpm", 0xFDB44700: "millirpm", 0x00B50300: "increments_per_s"}

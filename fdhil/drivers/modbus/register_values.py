@@ -22,7 +22,7 @@ CODES = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32"
 def count_registers(kind: str) -> int:
     """Return the number of registers of one number.
 
-    >>> registers_of("float64")
+    >>> count_registers("float64")
     4
     """
     return struct.calcsize(CODES[kind]) // 2
@@ -33,9 +33,9 @@ def decode_numbers(
 ) -> Float:
     """Decode consecutive numbers (n,) of this type.
 
-    >>> float(numbers([0x0000, 0x4248], "float32", "little")[0])
+    >>> float(decode_numbers([0x0000, 0x4248], "float32", "little")[0])
     50.0
-    >>> float(numbers([0x4842, 0x0000], "float32", byte_order="little")[0])
+    >>> float(decode_numbers([0x4842, 0x0000], "float32", byte_order="little")[0])
     50.0
     """
     words = np.array(registers, ">u2").reshape(-1, count_registers(kind))
@@ -49,7 +49,7 @@ def decode_numbers(
 def decode_float32(registers: Sequence[int], at: int = 0) -> float:
     """Decode the float32 in two registers, high word first.
 
-    >>> float32([0x4248, 0x0000])
+    >>> decode_float32([0x4248, 0x0000])
     50.0
     """
     return float(decode_numbers(registers[at : at + 2], "float32")[0])

@@ -17,7 +17,7 @@ _ECHO_BYTES, _EXCEPTION_BYTES, _LEAST_BYTES = 8, 5, 5
 def compute_crc16(data: bytes) -> int:
     """Return the checksum, its low byte in the upper half; over a frame with its checksum it is 0.
 
-    >>> hex(crc16(bytes.fromhex("01 04 00 00 00 02")))
+    >>> hex(compute_crc16(bytes.fromhex("01 04 00 00 00 02")))
     '0x71cb'
     """
     return FramerRTU.compute_CRC(data)
@@ -32,7 +32,7 @@ def build_frame(unit: int, body: bytes) -> bytes:
 def count_data_bytes(function: int, count: int) -> int:
     """Return the bytes that ``count`` bits or registers take in an answer.
 
-    >>> data_bytes(READ_COILS, 9), data_bytes(READ_INPUT, 9)
+    >>> count_data_bytes(READ_COILS, 9), count_data_bytes(READ_INPUT, 9)
     (2, 18)
     """
     return (count + 7) // 8 if function in BIT_READS else 2 * count
@@ -41,7 +41,7 @@ def count_data_bytes(function: int, count: int) -> int:
 def unpack_values(data: bytes, function: int, count: int) -> tuple[int, ...]:
     """Unpack the bits (0 or 1) or the registers of an answer's data.
 
-    >>> numbers_in(bytes([0b101]), READ_COILS, 3)
+    >>> unpack_values(bytes([0b101]), READ_COILS, 3)
     (1, 0, 1)
     """
     if function in BIT_READS:

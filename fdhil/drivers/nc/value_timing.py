@@ -8,7 +8,7 @@ def bound_value_time(asked_ns: int, answered_ns: int, renewed_s: float) -> tuple
 
     It was read between request and answer, and was then up to ``renewed_s`` old.
 
-    >>> between(1_000_000, 3_000_000, 0.002)
+    >>> bound_value_time(1_000_000, 3_000_000, 0.002)
     (1000000, 2000000)
     """
     earliest_ns = asked_ns - round(renewed_s * 1e9)

@@ -53,7 +53,7 @@ METHODS = frozenset({*_EDGES, *(method - 16 for method in _EDGES), *_PULSES, 35,
 def plan_moves(method: int, inputs: int) -> list[HomingMove]:
     """Return the moves of a method from a position with these inputs.
 
-    >>> [leg.direction for leg in legs(17, 0)], [leg.direction for leg in legs(17, 1)]
+    >>> [leg.direction for leg in plan_moves(17, 0)], [leg.direction for leg in plan_moves(17, 1)]
     ([-1, 1], [1])
     """
     if method in _PULSES:

@@ -174,7 +174,7 @@ class ClosedLoops(Enum):
 def select_gains(gains: Float, loops: ClosedLoops) -> Float:
     """Return the gains (4,) KV, KFF, KPS, KIS with those of the open loops at zero.
 
-    >>> gains_of(np.array([50.0, 1.0, 23.0, 1184.0]), Loops.SPEED).tolist()
+    >>> select_gains(np.array([50.0, 1.0, 23.0, 1184.0]), ClosedLoops.SPEED).tolist()
     [0.0, 0.0, 23.0, 1184.0]
     """
     position, speed = loops is ClosedLoops.POSITION, loops is not ClosedLoops.CURRENT

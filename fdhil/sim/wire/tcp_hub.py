@@ -40,7 +40,7 @@ def encode_frames(frames: Sequence[Frame], stamp_s: float) -> bytes:
 def decode_send_command(command: bytes) -> Frame | None:
     """Return the frame of a ``send`` command (without its closing bracket), None when it is malformed.
 
-    >>> decode_send(b"< send 181 2 a ff ")
+    >>> decode_send_command(b"< send 181 2 a ff ")
     (385, b'\\n\\xff')
     """
     words = command.split()
