@@ -22,12 +22,12 @@ LIMITS = "fdhil.guard.offset_limits"
 def test_mutants_cover_functions_properties_tables_and_constants() -> None:
     import_module("fdhil.guard.guard_step")  # only what is loaded is searched for who reads a table
     code = {mutant.name for mutant in mutate_code(LIMITS)}
-    assert "limits.clamp: return min(max(value, low), high) -> return min(max(value, low), None)" in code
-    assert "limits.Travel.total: return self.current + sum(self.past) -> return self.current - sum(self.past)" in code
-    assert "limits.CEILING_OFFSET_UM: 250 -> 251" in {mutant.name for mutant in mutate_values(LIMITS)}
+    assert "offset_limits.limit_value: return min(max(value, low), high) -> return min(max(value, low), None)" in code
+    assert "offset_limits.OffsetTravel.total: return self.current + sum(self.past) -> return self.current - sum(self.past)" in code
+    assert "offset_limits.CEILING_OFFSET_UM: 250 -> 251" in {mutant.name for mutant in mutate_values(LIMITS)}
     assert not {mutant.place for mutant in mutate_values("fdhil.guard.state_transitions")} & {"SENT", "TRANSITIONS"}
     rows = {mutant.name for mutant in mutate_values("fdhil.guard.interlocks")}
-    assert "interlocks.CATALOGUE: BusOff: FREEZE -> REFUSE" in rows
+    assert "interlocks.INTERLOCK_CATALOGUE: BusOff: FREEZE -> REFUSE" in rows
     assert "interlocks.FACTS: model_fresh -> no such row" in rows
     predicates = {mutant.place for mutant in mutate_code("fdhil.guard.interlock_checks")}
     assert "AXIS_INTERLOCKS[StaleData]" in predicates
@@ -36,8 +36,8 @@ def test_mutants_cover_functions_properties_tables_and_constants() -> None:
 def test_mutant_replaces_imported_names() -> None:
     from fdhil.guard.offset_limits import limit_value
 
-    turned = Mutant(LIMITS, "clamp", "", "", "def clamp(value, low, high):\n    return max(max(value, low), high)\n")
-    function, code = limit_value, find_function(LIMITS, "clamp").__code__
+    turned = Mutant(LIMITS, "limit_value", "", "", "def limit_value(value, low, high):\n    return max(max(value, low), high)\n")
+    function, code = limit_value, find_function(LIMITS, "limit_value").__code__
     try:
         apply_mutant(turned)
         assert function(5, 1, 3) == 5
@@ -49,7 +49,7 @@ def test_mutant_replaces_imported_names() -> None:
 @pytest.mark.usefixtures("processes")
 def test_mutants_are_detected_by_tests_of_the_function(tmp_path: Path) -> None:
     """The study on a small module: called and checked code is detected, uncalled code is reported."""
-    options = ["--modules", "requests", "--every", "12", "--tests", "tests/guard/test_request_parsing.py"]
+    options = ["--modules", "request_parsing", "--every", "12", "--tests", "tests/guard/test_request_parsing.py"]
     command = [sys.executable, "-m", "studies.mutants", *options, "--out", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
