@@ -13,7 +13,7 @@ LINUXCNC := tests/linuxcnc tests/program
 N       ?= 2000
 SECONDS ?= 100000
 
-# a child process need not translate fdhil anew
+# a child process need not translate fdhil again
 unexport PYTHONDONTWRITEBYTECODE
 
 # folders that make test and make test-processes leave out, as .ci/run does for the guard's, which make guard tests
@@ -143,7 +143,7 @@ bench: setup     ## the benchmarks; results go to docs/benchmarks.md
 study: setup     ## the Monte-Carlo studies; results go to docs/
 	@$(BIN)/python -m studies
 
-lock:            ## resolve requirements.lock anew (needs uv)
+lock:            ## resolve requirements.lock again (needs uv)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --upgrade \
 	  --group dev pyproject.toml -o requirements.lock >/dev/null
 

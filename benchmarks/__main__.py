@@ -2,7 +2,7 @@
 
 python -m benchmarks [NAME...]             run these, or all; the others keep the figures they have
 python -m benchmarks NAME --minutes 60     what follows the name goes to that benchmark
-python -m benchmarks --pages               write the page anew from the figures that are there
+python -m benchmarks --pages               write the page again from the figures that are there
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ class Bench:
         return time.process_time() + measure_processor_s(server.pid) + measure_database_s(self.database)
 
     async def reset_stream(self) -> None:
-        """Make the stream anew; the old one would know the messages again."""
+        """Make the stream again; the old one would know the messages again."""
         with suppress(nats.js.errors.NotFoundError):
             await self.client.jetstream().delete_stream(self.fleet.stream.name)
         await prepare_record_stream(self.client.jetstream(), self.fleet.stream)

@@ -1,7 +1,7 @@
 """``make study``: run the Monte-Carlo studies and write their figures and pages to docs/studies.
 
 python -m studies [NAME...]      measure, with the studies' own defaults
-python -m studies --pages        write the pages anew from the figures that are there
+python -m studies --pages        write the pages again from the figures that are there
 """
 
 from __future__ import annotations

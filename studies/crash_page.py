@@ -79,7 +79,7 @@ def _describe_calls(kinds: Figures) -> list[str]:
     whole = sorted(name for name, kind in kinds.items() if kind["tried"] == kind["faults"])
     part = [f"{name} ({kind['tried']} of {kind['faults']})" for name, kind in kinds.items() if name not in whole]
     text = f"""A process keeps three records while strace has its nth open, write, sync, rename, link or removal
-        fail, lie or kill it, for every n. Then the product starts anew, must have all that was acknowledged, each
+        fail, lie or kill it, for every n. Then the product starts again, must have all that was acknowledged, each
         record whole, and keeps one more. "Full from then on" is a disk that stays full. A kernel that says that it
         wrote and did not can lose a record ("lost to a lie"): none of those may be believed half. "Wrong" are losses,
         ends with anything but a sentence, and starts that did not do. All faults were tried of:

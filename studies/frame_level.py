@@ -131,7 +131,7 @@ def _begin(cut: Cut, row: str, of: Row, rng: np.random.Generator) -> None:
     cut.changed_at = cut.tick
     if of.tamper is not None:
         cut.tamper = of.tamper(rng)
-        if row == "A9":  # not to where the counter may begin anew
+        if row == "A9":  # not to where the counter may begin again
             cut.counter = (cut.counter + int(rng.integers(4, 230))) % 240 or 100
     for cob_id, data in of.insert(rng) if of.insert is not None else ():
         cut.inject_frame(cob_id, data)

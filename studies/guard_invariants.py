@@ -304,7 +304,7 @@ def offset_by_sdo(walk: Walk) -> None:
 
 
 HAPPENINGS: tuple[tuple[str, Callable[[Walk], None]], ...] = (
-    *[("armed anew", armed)] * 6,
+    *[("armed again", armed)] * 6,
     *[("guard restarted", restarted)] * 2,
     *[("foreign offset frame", offset_frame)] * 2,
     ("foreign offset by SDO", offset_by_sdo),

@@ -397,7 +397,7 @@ class LiveGuard:
         places = dict(zip(AXES, demand, strict=True))
         time_s: Float = np.arange(ROWS, dtype=np.float64) * PERIOD_S
         self.program = Trajectory(PERIOD_S, time_s, places, nothing.astype(bool), nothing)
-        self.idle = True  # whoever is to arm has the processor to himself
+        self.idle = True  # the client that arms has the processor to itself
         seen = len(self.events)
         daemon = self.daemon = Daemon(self.folder, increments, offsets)
         self.run_until(lambda: daemon.armed and self.has_journal_state("ARMED", seen), "armed")

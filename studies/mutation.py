@@ -3,7 +3,7 @@
 mutmut makes the mistakes of the code (an operator turned, a number one higher, an argument left out); a constant is one
 higher, a table has a row less. The tests are collected once, and each mistake is judged in a process forked from there,
 by the tests that call the changed function, until one fails. A mistake replaces the code of a function or the value of
-a name wherever it was imported, so that no module need be loaded anew.
+a name wherever it was imported, so that no module need be loaded again.
 """
 
 from __future__ import annotations

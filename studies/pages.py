@@ -1,7 +1,7 @@
 """A study's page and the figures under it: NAME.json holds what was measured and how, NAME.md is written from it alone.
 
 A study is a module with ``page(run, figures)``, which returns the page's text, and, where there is a plot,
-``draw(figures, path)``. So a page can be written anew without measuring anew (``python -m studies --pages``), and a
+``draw(figures, path)``. So a page can be written again without measuring again (``python -m studies --pages``), and a
 test sees that each page is what its figures say.
 """
 

@@ -1,7 +1,7 @@
 """Counts how often a good rapid is refused, and whether any bad one is accepted (``python -m studies.verdicts``).
 
-Every recording is simulated anew with its own seed: drive, move, noise, resolution and sampling are drawn; each bad one
-gets one fault of random severity. The table goes to ``docs/studies/verdicts.md``.
+Every recording is simulated again with its own seed: drive, move, noise, resolution and sampling are drawn; each bad
+one gets one fault of random severity. The table goes to ``docs/studies/verdicts.md``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page."""
     lines = pages.write_head("Good windows refused, bad windows accepted", "verdicts", run)
     lines += pages.wrap_paragraph(
-        """Every recording is simulated anew: drives from 15 to 250 V and 3 to 150 A, windings of 3 to 20 ms, inertia
+        """Every recording is simulated again: drives from 15 to 250 V and 3 to 150 A, windings of 3 to 20 ms, inertia
         and friction to match, pitch 5 to 40 mm, rapids of 9 to 60 m/min at 1.5 to 8 m/s2 with 5 to 60 ms smoothing,
         rows 0.25 to 2 ms apart, voltage as means or instants, noise 0.1 to 0.5 %, sensors in steps of 0.001 to 0.2 % of
         their peak, positions in 0.1 to 5 um. Each bad recording has one fault of random severity, whose smallest is

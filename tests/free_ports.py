@@ -6,7 +6,7 @@ import random
 import socket
 from contextlib import suppress
 
-BELOW_EPHEMERAL = range(10_000, 30_000)  # whoever asks the kernel for any port is given a higher one
+BELOW_EPHEMERAL = range(10_000, 30_000)  # the kernel gives a higher one to a program that asks for any port
 
 
 def find_free_port() -> int:

@@ -1,4 +1,4 @@
-"""Keeps the operator's token: whoever can read it (mode 0600, in the run directory) may arm. It is never logged."""
+"""Keeps the operator's token: anyone who can read it (mode 0600, in the run directory) may arm. It is never logged."""
 
 import os
 import secrets

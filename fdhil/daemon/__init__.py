@@ -1,4 +1,4 @@
-"""The service: sources in, pipelines in worker threads, outcomes to the store and to whoever asks."""
+"""The service: sources in, pipelines in worker threads, outcomes to the store and to its clients."""
 
 from fdhil.lazy_exports import export_names
 

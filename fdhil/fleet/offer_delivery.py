@@ -98,7 +98,7 @@ async def _replace_open_offers(stream: JetStreamContext, machine: str, name: str
 
 
 def _is_still_open(document: bytes, name: str) -> bool:
-    """Whether an open offer is kept: expired ones, and those of this name, are dropped whoever signed them."""
+    """Whether an open offer is kept: expired ones, and those of this name, are dropped, whatever key signed them."""
     try:
         other = read_offer(document, {_read_signer(document)})
     except OfferRefused:

@@ -1,6 +1,6 @@
 """Passes a correction table to the guard as a descriptor of sealed memory, and checks it row by row.
 
-Sealed memory cannot change, shrink or block while it is read, whoever else still has it open.
+Sealed memory cannot change, shrink or block while it is read, even if another process still has it open.
 """
 
 import fcntl

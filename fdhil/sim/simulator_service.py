@@ -81,8 +81,8 @@ class SyncPace:
 class DriveClock:
     """The time base of the drives' heartbeats and time-outs.
 
-    It slows down when the host was late: a real drive has no such pauses. In lockstep it advances with SYNC, whoever
-    produces it, until SYNC has been missing for LOCKSTEP_WAIT_S.
+    It slows down when the host was late: a real drive has no such pauses. In lockstep it advances with SYNC, whichever
+    program produces it, until SYNC has been missing for LOCKSTEP_WAIT_S.
     """
 
     def __init__(self, period_s: float, *, lockstep: bool) -> None:

@@ -39,7 +39,7 @@ class MachinePeer:
             self.rows = []
         if path.first != len(self.rows):
             return {"ok": False, "code": "ProgramMismatch", "text": "these rows do not continue the table"}
-        self.final = path.final  # first: whoever sees the rows may move
+        self.final = path.final  # first: a client that sees the rows may move
         self.rows += list(zip(*path.demand, *path.offset, strict=True))
         return {"ok": True, "rows": [0, len(self.rows)]}
 

@@ -72,19 +72,19 @@ def test_error_before_first_corner_is_removed(text: str, tmp_path: Path) -> None
     assert rows is not None
     assert first.begin is begin
     first.apply_rows(rows)
-    anew = first.begin
-    before, after = (simulate_cut(program, piece, amperes, CONFIG) for piece in (begin, anew))
+    recomputed = first.begin
+    before, after = (simulate_cut(program, piece, amperes, CONFIG) for piece in (begin, recomputed))
     without = simulate_cut(program, begin, {"X": 0.0, "Y": 0.0}, CONFIG)
     assert compute_rms(after[:600]) < 0.2 * compute_rms(before[:600])
     assert compute_rms(after) < 1.1 * compute_rms(without)
-    assert anew.demand == begin.demand
-    assert all(rows.offset[axis] == anew.offset[axis][: len(rows.offset[axis])] for axis in "XY")
-    assert all(rows.demand[axis] == anew.demand[axis][: len(rows.offset[axis])] for axis in "XY")
+    assert recomputed.demand == begin.demand
+    assert all(rows.offset[axis] == recomputed.offset[axis][: len(rows.offset[axis])] for axis in "XY")
+    assert all(rows.demand[axis] == recomputed.demand[axis][: len(rows.offset[axis])] for axis in "XY")
     for axis in "XY":
-        assert len(anew.offset[axis]) == len(begin.offset[axis])
-        assert anew.offset[axis][1700:] == begin.offset[axis][1700:] or text == SHORT
+        assert len(recomputed.offset[axis]) == len(begin.offset[axis])
+        assert recomputed.offset[axis][1700:] == begin.offset[axis][1700:] or text == SHORT
         limits = PlanLimits.derive(CONFIG.axis[axis], 0.001)
-        assert check_offsets(np.array(anew.offset[axis]), limits) == []
+        assert check_offsets(np.array(recomputed.offset[axis]), limits) == []
 
 
 def test_correct_rows_are_kept(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ class SensorPeer:
     def __init__(self, rate_hz: float = 1000.0) -> None:
         self.rate_hz = rate_hz
         self.mode = "good"
-        self.start = time.monotonic() - 0.05  # whoever asks finds samples, however soon he asks
+        self.start = time.monotonic() - 0.05  # a client finds samples, however early it asks
         self.latched = 0
         self.block: list[int] = []
         self.status = 0

@@ -204,12 +204,12 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
 
 
 async def fetch_offers(
-    config: MachineConfig, letterbox: OfferFetcher | None = None, timeout_s: float = 60.0
+    config: MachineConfig, fetcher: OfferFetcher | None = None, timeout_s: float = 60.0
 ) -> list[str]:
     """Let a machine fetch offers, and return those present."""
     assert config.uplink is not None
     async with connect_to_server(config.uplink, f"fdhil-{config.plant_name}", "uplink") as client:
-        await (letterbox or OfferFetcher(config)).fetch_offers(client.jetstream(timeout=timeout_s), "5" * 32)
+        await (fetcher or OfferFetcher(config)).fetch_offers(client.jetstream(timeout=timeout_s), "5" * 32)
     return sorted(path.name for path in list_offers(config.offers_directory))
 
 
@@ -260,8 +260,8 @@ async def test_offers_stay_without_permission_or_stream(
     config = machine_config.load_config(file)
     config.offers_directory.mkdir(parents=True)
     (config.offers_directory / "friction-3.offer").write_bytes(works.sign_document())
-    letterbox = OfferFetcher(config)
+    fetcher = OfferFetcher(config)
     for _ in range(2):
-        letterbox._next_s = 0.0
-        assert await fetch_offers(config, letterbox, timeout_s=1.0) == ["friction-3.offer"]  # it is never answered
+        fetcher._next_s = 0.0
+        assert await fetch_offers(config, fetcher, timeout_s=1.0) == ["friction-3.offer"]  # it is never answered
     assert capfd.readouterr().err.count("offers cannot be fetched") == 1

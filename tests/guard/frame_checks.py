@@ -13,7 +13,7 @@ CEILING = 819
 class Wire:
     """``ours`` returns what is wrong with a frame of the guard, None when nothing is.
 
-    A frame may continue the last one on the bus, whoever sent it, or the drive's offset: anything else is a step. A
+    A frame may continue the last one on the bus, whatever sent it, or the drive's offset: anything else is a step. A
     cycle without our frame stops the offset.
     """
 

@@ -66,7 +66,7 @@ def test_run_of_other_code_starts_new_total_and_lists_earlier_one(tmp_path: Path
     assert again["earlier"] == [{"commit": "0123abcd", "machines": 1, "machine_s": 70.0, "failures": 1}]
 
 
-# where the signal comes within a callback of the garbage collector its exception goes no further: the run says so all the same
+# where the signal comes within a callback of the garbage collector, its exception ends there; the run still reports it
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_endless_run_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(swarm, "MOST_CPU_S", 0.02)

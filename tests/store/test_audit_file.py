@@ -121,7 +121,7 @@ def test_entry_after_a_long_line_is_read(tmp_path: Path) -> None:
 
 def test_locked_audit_is_awaited_and_then_reported(audit_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(audit_file, "LOCKED_S", 0.05)
-    with (audit_folder / audit_file.AUDIT_FILE_NAME).open() as reader:  # whoever may read it may lock it, too
+    with (audit_folder / audit_file.AUDIT_FILE_NAME).open() as reader:  # anyone who may read it may lock it, too
         fcntl.flock(reader, fcntl.LOCK_EX)
         with pytest.raises(StoreError, match="another process holds its lock"):
             audit_file.append_entry(audit_folder, {"asked": "arm"})

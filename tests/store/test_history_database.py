@@ -319,7 +319,7 @@ def test_repeated_reader_checks_intact_file_once(tmp_path: Path, monkeypatch: py
         assert history.read_windows() == []
     with History.open_read_only(tmp_path):
         pass
-    assert checks == [True, True], "a new file is looked at anew, and so is any for who keeps nothing"
+    assert checks == [True, True], "a new file is looked at again, and so is any for who keeps nothing"
 
 
 LATIN_1 = "/nc/b\udcf6hlen.ngc"  # as Linux hands a Latin-1 file name over

@@ -154,7 +154,7 @@ def test_two_buses_and_restarted_daemon_share_one_tick_count() -> None:
     assert abs(x.end - y.end) * PERIOD_S < 60  # both by when they came, on however busy a host
     assert abs(x.end - time.monotonic() / PERIOD_S) * PERIOD_S < 60
     before = x.end
-    feed.take_line(make_line("X", range(20)))  # the count begins anew
+    feed.take_line(make_line("X", range(20)))  # the count begins again
     assert x.end >= before + 20
     assert np.isfinite(x.read_samples(x.end - 20, x.end)[0]).all()
     assert np.isfinite(x.read_samples(before - 400, before)[0]).all()

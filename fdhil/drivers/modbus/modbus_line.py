@@ -80,7 +80,7 @@ def make_timeout(request: ModbusRequest, advice: str = "check the device and its
 
 
 class ModbusLine(Protocol):
-    """A line to units: one request at a time, whoever the client. ``users`` are the units that need the line;
+    """A line to units: one request at a time, for any number of clients. ``users`` are the units that need the line;
     ``fault_counts`` counts recovered faults by code."""
 
     place: str
