@@ -19,9 +19,9 @@ pytestmark = pytest.mark.usefixtures("processes")
 ENDED = [sys.executable, "-c", "import sys; sys.stdin.read()"]
 PARENT = """
 import os, subprocess, sys
-from fdhil.child_process import ending_with_parent
+from fdhil.child_process import wrap_to_end_with_parent
 code = "import signal, sys; print('up', flush=True); signal.pause()"
-subprocess.Popen(ending_with_parent([sys.executable, "-c", code]), stdin=subprocess.DEVNULL)
+subprocess.Popen(wrap_to_end_with_parent([sys.executable, "-c", code]), stdin=subprocess.DEVNULL)
 sys.stdin.read()
 """
 

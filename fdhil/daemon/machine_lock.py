@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fdhil.errors import DeviceError
 
-LOCK_NAME = "daemon.machine_lock"
+LOCK_NAME = "daemon.lock"
 
 
 class BusLocked(DeviceError):

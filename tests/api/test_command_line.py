@@ -123,8 +123,8 @@ import sys
 for name in ("pyarrow", "can", "canopen", "pymodbus", "serial", "matplotlib", "fastapi"):
     sys.modules[name] = None
 import fdhil
-from tests.api.motor_recordings import measured
-m = measured("chirp")
+from tests.api.motor_recordings import record_motor
+m = record_motor("chirp")
 print(fdhil.identify(fdhil.Recording(m.time, m.voltage, m.current, m.speed), any_move=True).validated)
 """
 

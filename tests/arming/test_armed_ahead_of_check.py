@@ -232,7 +232,9 @@ async def test_later_refusal_is_reported_long_before_motion(
         await shop.wait_until(shop.list_major_notices)
         refused = shop.list_major_notices()[0]
         assert refused.code == "DemandTooHigh"
-        place = re.search(rf"line {HARD_LINE}, at (\d+\.\d+) s: axis X has a current or voltage limit", refused.text)
+        place = re.search(
+            rf"line {HARD_LINE}, at (\d+\.\d+) s: axis X is at its current or voltage limit", refused.text
+        )
         left = re.search(r"corrected for another (\d+\.\d) s, then ramped to zero before that line", refused.text)
         assert place, refused.text
         assert left, refused.text

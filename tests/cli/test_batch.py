@@ -120,13 +120,13 @@ def test_terminal_shows_progress(recordings: list[Path], capsys: pytest.CaptureF
 
 ANALYSING = """
 import os, sys, time
-from fdhil.cli import batch
+from fdhil.cli import batch_analysis
 def told(_):
     print("up", flush=True)
     time.sleep(600)
 if __name__ == "__main__":
-    batch._cores = lambda: 2
-    with batch._processes() as executor:
+    batch_analysis._count_cores = lambda: 2
+    with batch_analysis._create_process_pool() as executor:
         list(executor.map(told, range(2)))
 """
 

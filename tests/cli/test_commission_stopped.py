@@ -23,8 +23,9 @@ pytestmark = pytest.mark.usefixtures("processes")
 QUICK = """
 import importlib
 for module, name, value in (
-    ("survey", "LISTEN_S", 0.3), ("steps", "SETTLE_CYCLES", 120), ("steps", "AVERAGE_CYCLES", 60),
-    ("trial", "TIMING_CYCLES", 100), ("trial", "LAST_REST_S", 0.4), ("strokes", "JOG_MM", 1.0),
+    ("drive_survey", "LISTEN_S", 0.3), ("commissioning_steps", "SETTLE_CYCLES", 120),
+    ("commissioning_steps", "AVERAGE_CYCLES", 60),
+    ("axis_trial", "TIMING_CYCLES", 100), ("axis_trial", "LAST_REST_S", 0.4), ("stroke_planning", "JOG_MM", 1.0),
 ):
     setattr(importlib.import_module("fdhil.commissioning." + module), name, value)
 from fdhil.cli.main import main

@@ -148,13 +148,17 @@ def test_realistic_process_stops_in_order_when_demo_ends_first(tmp_path: Path, m
 RUNNING = """
 import sys
 from pathlib import Path
-from fdhil.child_process import stopping_in_order
+from fdhil.child_process import interrupt_on_stop_signals
 from fdhil.cli.demo import loop
-from fdhil.cli.demo.machines import machine_document
-loop._commission = lambda stage: None  # arming is not needed here
-with stopping_in_order(), loop.running(Path(sys.argv[1]), False, lambda text: None, machine_document()) as stage:
-    loop._await(lambda: stage.ask("status")["may_stand"]["nothing"], "the guard did not read the drives", stage)
-    print(stage.twin.pid, *(process.pid for process in stage.others), flush=True)
+from fdhil.cli.demo.machines import load_machine_document
+loop._commission_axes = lambda stage: None  # arming is not needed here
+with (
+    interrupt_on_stop_signals(),
+    loop.start_machine(Path(sys.argv[1]), False, lambda text: None, load_machine_document()) as stage,
+):
+    is_known = lambda: stage.ask_daemon("status")["may_stand"]["nothing"]
+    loop._wait_until(is_known, "the guard did not read the drives", stage)
+    print(stage.simulator.pid, *(process.pid for process in stage.others), flush=True)
     sys.stdin.read()
 """
 

@@ -284,4 +284,4 @@ def test_columns_of_different_lengths_give_json_error(tmp_path: Path) -> None:
     io.savemat(tmp_path / "short.mat", {name: list(range(50 + (name == "Current"))) for name in names})
     result = run_cli(tmp_path / "short.mat", "--columns", columns, "--json")
     assert result.return_value == 3
-    assert "unlike lengths" in load_json_document(result)["files"][0]["error"]["text"]
+    assert "different lengths" in load_json_document(result)["files"][0]["error"]["text"]

@@ -30,9 +30,10 @@ STROKE = "G21 G90 G94\nG1 X300 F1500\nM2\n"  # longer than any delay of the host
 SETPOINTS = "[axis.X.setpoints]\ntravel_mm = [-10.0, 400.0]\n[axis.Y.setpoints]\ntravel_mm = [-10.0, 10.0]\n"
 # fdhil as a process of its own that waits a shorter time than on a real machine
 QUICK = """
-from fdhil.commissioning import steps, survey
-from fdhil.drivers.can import sdo
-survey.LISTEN_S, steps.SETTLE_CYCLES, sdo.RESPONSE_TIMEOUT_S, sdo.DEADLINE_S = 0.3, 50, 1.0, 20.0
+from fdhil.commissioning import commissioning_steps, drive_survey
+from fdhil.drivers.can import sdo_channel
+drive_survey.LISTEN_S, commissioning_steps.SETTLE_CYCLES = 0.3, 50
+sdo_channel.RESPONSE_TIMEOUT_S, sdo_channel.DEADLINE_S = 1.0, 20.0
 from fdhil.cli.main import main
 main()
 """

@@ -228,10 +228,10 @@ def test_only_the_owner_may_open_the_socket_unless_users_are_named(open_folder: 
 ASK = """
 import json, os, sys
 from pathlib import Path
-from fdhil.daemon.daemon_socket import ask
+from fdhil.daemon.daemon_socket import ask_daemon
 os.setgroups([])
 os.setuid(int(sys.argv[2]))
-print(json.dumps([ask(Path(sys.argv[1]), {"request": what}) for what in ("status", "disarm", "arm", "stop")]))
+print(json.dumps([ask_daemon(Path(sys.argv[1]), {"request": what}) for what in ("status", "disarm", "arm", "stop")]))
 """
 
 

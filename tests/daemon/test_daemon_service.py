@@ -145,7 +145,7 @@ async def test_second_daemon_of_a_machine_is_refused(tmp_path: Path) -> None:
     async with serving(config, SimulatedMachine()):
         with pytest.raises(BusLocked, match=f"process {os.getpid()}"):
             await DaemonService(config, SimulatedMachine().open).run()
-        config.run_directory.joinpath("daemon.machine_lock").unlink()  # somebody cleans up
+        config.run_directory.joinpath("daemon.lock").unlink()  # somebody cleans up
         with pytest.raises(BusLocked, match="another daemon writes to this store"):
             await DaemonService(config, SimulatedMachine().open).run()
 

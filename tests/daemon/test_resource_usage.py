@@ -24,18 +24,18 @@ def used() -> dict[str, int]:
 
 FREED = """
 import numpy as np
-from fdhil.daemon.malloc_tuning import keep_small
-from fdhil.daemon.resource_usage import uses
-keep_small()
+from fdhil.daemon.malloc_tuning import limit_heap_growth
+from fdhil.daemon.resource_usage import measure_usage
+limit_heap_growth()
 for _ in range(3):
     np.ones(3 << 20)  # by itself glibc would lay blocks of up to this size among the small ones from now on
-before = uses()[0].used
+before = measure_usage()[0].used
 large, small = [], []
 for _ in range(40):
     large.append(np.ones(1 << 17))
     small.append(np.ones(100))
 del large
-print(uses()[0].used - before)
+print(measure_usage()[0].used - before)
 """
 
 
@@ -46,13 +46,13 @@ def test_freed_large_block_is_returned_to_the_system() -> None:
 
 
 BETWEEN = """
-from fdhil.daemon.malloc_tuning import give_back
-from fdhil.daemon.resource_usage import uses
+from fdhil.daemon.malloc_tuning import trim_heap
+from fdhil.daemon.resource_usage import measure_usage
 small = [bytes(1000) for _ in range(40_000)]
 small = small[::200]  # a used one in every 200 kB
-before = uses()[0].used
-give_back()
-print(before - uses()[0].used)
+before = measure_usage()[0].used
+trim_heap()
+print(before - measure_usage()[0].used)
 """
 
 
@@ -64,8 +64,8 @@ def test_free_pages_between_used_blocks_are_returned() -> None:
 
 GROW = """
 import os, threading
-from fdhil.daemon.resource_usage import uses
-used = lambda: [use.used for use in uses()]
+from fdhil.daemon.resource_usage import measure_usage
+used = lambda: [use.used for use in measure_usage()]
 before = used()
 block, pipe, ended = bytearray(os.urandom(1) * 20_000_000), os.pipe(), threading.Event()
 threading.Thread(target=ended.wait).start()

@@ -261,7 +261,7 @@ def test_any_frames_survive_conversion_or_are_counted(
         return
     out, reported = convert_file(text, name, folder)
     module = import_module(f"fdhil.drivers.can.{name}_log")
-    came = list(module.read(out, Counter()))
+    came = list(module.read_frames(out, Counter()))
     assert reported.frames == len(came) == len(sent) - sum(reported.left_out.values())
     renamed = {"vcan0": f"can{int(reported.buses['vcan0']) - 1}"} if name == "blf" and "vcan0" in reported.buses else {}
     for got, frame in zip(came, wanted, strict=True):

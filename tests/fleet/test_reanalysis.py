@@ -154,8 +154,8 @@ def test_killed_reanalysis_resumes_to_identical_results(
     alone = database.execute_query(ROWS)
     database.execute_query("TRUNCATE fleet.reanalyses RESTART IDENTITY CASCADE")
     code = f"""
-from tests.fleet.test_reanalysis import slowly
-slowly({str(fleet_settings)!r})
+from tests.fleet.test_reanalysis import analyse_slowly
+analyse_slowly({str(fleet_settings)!r})
 """
     process = subprocess.Popen([sys.executable, "-c", code])
     wait_until(lambda: len(database.execute_query(ROWS)) >= 4, "some windows are done")

@@ -159,8 +159,8 @@ def test_larger_limit_loosens_and_smaller_one_does_not() -> None:
         False,
         False,
     )
-    assert is_loosening("correction.learned_offsets", False, True)
-    assert not is_loosening("correction.learned_offsets", True, False)
+    assert is_loosening("correction.learning", False, True)
+    assert not is_loosening("correction.learning", True, False)
     assert is_loosening("identification.tolerance_um", None, 1.0)  # which of the two is larger depends
     assert not is_loosening("axis.X.nominal.ft", 1.0, 2.0)
 

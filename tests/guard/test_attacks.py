@@ -179,10 +179,10 @@ def test_stop_signals_ramp_down_before_the_exit(rig: Rig) -> None:
 
 BROKEN = """
 import sys
-from fdhil.guard import process, __main__
+from fdhil.guard import __main__, guard_process
 def fail(*_):
     raise {error}
-process.Guard.status = fail
+guard_process.Guard.build_status = fail
 sys.exit(__main__.main())
 """
 

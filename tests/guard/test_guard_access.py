@@ -145,7 +145,7 @@ from fdhil.arming.guard_client import GuardClient
 os.setgroups([])
 os.setuid(int(sys.argv[2]))
 with GuardClient(Path(sys.argv[1]), 60.0) as guard:
-    print(json.dumps([guard.ask({"request": what}) for what in ("status", "disarm", "adopt")]))
+    print(json.dumps([guard.send_request({"request": what}) for what in ("status", "disarm", "adopt")]))
 """
 
 

@@ -28,8 +28,9 @@ ROWS = 900
 TOKEN = "the operator's"
 PATIENT = """\
 from fdhil.cli.main import main
-from fdhil.sim import service
-service.LOCKSTEP_WAIT_S = service.LOCKSTEP_HOLDING_WAIT_S  # of a guard that is held up while its offset is 0, too
+from fdhil.sim import simulator_service
+# of a guard that is held up while its offset is 0, too
+simulator_service.LOCKSTEP_WAIT_S = simulator_service.LOCKSTEP_HOLDING_WAIT_S
 main()
 """
 

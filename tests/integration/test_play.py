@@ -19,10 +19,12 @@ from tests.integration.test_guard import DIGEST, arm, guarded, missed_until_it_i
 
 pytestmark = pytest.mark.socketcan
 QUICK = """
-from fdhil.commissioning import cycle, steps, survey
-from fdhil.drivers.can import sdo
-survey.LISTEN_S, steps.SETTLE_CYCLES, sdo.RESPONSE_TIMEOUT_S, sdo.DEADLINE_S = 0.3, 50, 5.0, 30.0
-cycle.GUARD_WAIT_S = 8.0  # a guard on a virtual machine's one processor may sleep for longer than it has a limit for
+from fdhil.commissioning import sync_cycle, commissioning_steps, drive_survey
+from fdhil.drivers.can import sdo_channel
+drive_survey.LISTEN_S, commissioning_steps.SETTLE_CYCLES = 0.3, 50
+sdo_channel.RESPONSE_TIMEOUT_S, sdo_channel.DEADLINE_S = 5.0, 30.0
+# a guard on a virtual machine's one processor may sleep for longer than it has a limit for
+sync_cycle.GUARD_WAIT_S = 8.0
 from fdhil.cli.main import main
 main()
 """

@@ -141,7 +141,7 @@ def test_script_and_plan_in_documentation_are_valid(tmp_path: Path) -> None:
     (program,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     reported: list[str] = []
     exec(program, {"print": lambda *words: reported.append(" ".join(map(str, words)))})
-    assert reported == ["0 frames were lost by plan"]
+    assert reported == ["0 frames dropped as planned"]
 
 
 def test_faults_of_one_connection_do_not_affect_other_clients(bench: FeedDriveBench) -> None:

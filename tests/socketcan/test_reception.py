@@ -51,9 +51,9 @@ with raw_socket() as raw, open(file, "rb") as shared, mmap.mmap(shared.fileno(),
 
 READER = """
 import sys, time
-from fdhil.config import CanBus as BusSettings
-from fdhil.drivers.can.bus_listener import CanBus
-with CanBus("can0", BusSettings(interface="socketcan", channel="vcan0")) as bus:
+from fdhil.config import ListeningBus as BusSettings
+from fdhil.drivers.can.bus_listener import ListeningBus
+with ListeningBus("can0", BusSettings(interface="socketcan", channel="vcan0")) as bus:
     print("ready", flush=True)
     sys.stdin.readline()
     last, got = -1, 0

@@ -77,9 +77,9 @@ def test_truncated_line_is_reported_and_next_one_is_intact(audit_folder: Path) -
 
 @pytest.mark.usefixtures("processes")
 def test_two_writing_processes_make_one_chain(tmp_path: Path) -> None:
-    code = "import sys; from pathlib import Path; from fdhil.store import audit\n"
-    code += "audit.LOCKED_S = 300.0\n"  # the other may have all its turns first, on a slow disk
-    code += "for k in range(50): audit.append(Path(sys.argv[1]), {'asked': 'arm', 'number': k})"
+    code = "import sys; from pathlib import Path; from fdhil.store import audit_file\n"
+    code += "audit_file.LOCKED_S = 300.0\n"  # the other may have all its turns first, on a slow disk
+    code += "for k in range(50): audit_file.append_entry(Path(sys.argv[1]), {'asked': 'arm', 'number': k})"
     writers = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(2)]
     assert [writer.wait(300) for writer in writers] == [0, 0]
     assert len(list(audit_file.read_entries(tmp_path))) == 100

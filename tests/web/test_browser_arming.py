@@ -99,7 +99,7 @@ def test_arm_and_disarm_by_keyboard(web_rig: WebRig, browser_tab: BrowserTab) ->
 def test_program_is_armed_on_the_page_of_its_forecast(web_rig: WebRig, operator: BrowserTab) -> None:
     machine, page = "section:has(#program-machine)", operator.page
     operator.open_page(f"/program/{web_rig.forecast_program(web_rig.log_in_for_token('operator'))}")
-    operator.wait_for_text(machine, operator.get_text("program.motion_builder.not_armed"))
+    operator.wait_for_text(machine, operator.get_text("program.machine.not_armed"))
     web_rig.wait_until_settled()
     page.get_by_role("button", name=operator.get_text("arm.open")).click()
     page.get_by_label(operator.get_text("arm.method"), exact=True).select_option("inverse")
@@ -108,7 +108,7 @@ def test_program_is_armed_on_the_page_of_its_forecast(web_rig: WebRig, operator:
     page.get_by_role("dialog").wait_for(state="detached")
     operator.wait_for_text(machine, operator.get_text("guard.ARMED"))
     page.get_by_role("button", name=operator.get_text("disarm"), exact=True).click()
-    operator.wait_for_text(machine, operator.get_text("program.motion_builder.not_armed"))
+    operator.wait_for_text(machine, operator.get_text("program.machine.not_armed"))
 
 
 def test_arming_request_can_be_cancelled(web_rig: WebRig, operator: BrowserTab) -> None:

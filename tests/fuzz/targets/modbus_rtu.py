@@ -25,16 +25,16 @@ class _Port:
     def __init__(self, pieces: Sequence[bytes]) -> None:
         self._pieces = list(pieces)
 
-    def discard(self) -> bool:
+    def discard_input(self) -> bool:
         return False
 
-    def wire_ns(self, _count: int) -> int:
+    def compute_wire_ns(self, _count: int) -> int:
         return 0
 
     def send(self, _name: str, _data: bytes) -> int:
         return time.monotonic_ns()
 
-    async def receive(self, _name: str, _until_ns: int) -> Chunk | None:
+    async def receive_chunk(self, _name: str, _until_ns: int) -> Chunk | None:
         return Chunk(self._pieces.pop(0), time.monotonic_ns()) if self._pieces else None
 
 
