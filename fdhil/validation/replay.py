@@ -19,8 +19,8 @@ OFF_GRID = 1e-3  # of a cycle, by which a row may differ from it
 SHARES_OF_LOAD = (0.0, -0.5, -0.25, -0.75, 0.5, 1.0, 2.0)  # of the friction in this direction, the likeliest first
 ENOUGH = 0.02  # of the following error: left with less, no better share is looked for
 STANDSTILL_S = 0.015  # over which the current before a move is taken
-REST_S = 0.05  # an axis at rest has stood for so long: within it a deviation that still decays shows as motion
-REST_MM, REST_STEPS = 3e-3, 3.0  # a position that changes by no more, or by no more of its own steps, stands
+REST_S, LEAST_REST_S = 0.05, 0.02  # an axis at rest has stood so long: a deviation that still decays shows as motion
+REST_MM, REST_STEPS = 3e-3, 2.5  # a position that changes by no more in REST_S, or by no more of its own steps, stands
 _EDGE = 8  # rows at either end that a shifted comparison leaves out
 
 
@@ -126,7 +126,7 @@ def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_pe
     None too where the axis had not come to rest before: what its regulators held then is not recorded.
     """
     begin = moving_range(window)[0]
-    rest = slice(begin - math.ceil(REST_S / window.dt_s), begin)
+    rest = slice(max(0, begin - math.ceil(REST_S / window.dt_s)), begin)
     if not _rows_are_setpoints(window, sync_period_s) or not _stands(window, rest):
         return None
     parameters = completed(parameters, Parameters(**axis.nominal.model_dump()))
@@ -182,10 +182,10 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
 
 def _stands(window: Window, rest: slice) -> bool:
     """Return whether the axis stands in these rows, but for steps and noise of its position."""
-    position = window.position_mm[max(rest.start, 0) : rest.stop]
+    position, lasts_s = window.position_mm[rest], (rest.stop - rest.start) * window.dt_s
     position = position[np.isfinite(position)]
-    limit_mm = max(REST_MM, REST_STEPS * resolution(window.position_mm))
-    return rest.start >= 0 and position.size > 0 and float(np.ptp(position)) <= limit_mm
+    limit_mm = max(REST_MM * lasts_s / REST_S, REST_STEPS * resolution(window.position_mm))
+    return lasts_s >= LEAST_REST_S and position.size > 0 and float(np.ptp(position)) <= limit_mm
 
 
 def _standstill_a(window: Window) -> float:
