@@ -257,7 +257,7 @@ def write_machine(
         lines = text.replace(",fffssff", ",ffssff").splitlines()
         text = "\n".join(line for line in lines if "joint.2" not in line)
     (folder / "machine.hal").write_text(f"{text}\n{hal}")
-    shutil.copy(HERE / "operator_by_wire.py", folder / "nobody_at_the_panel.py")
+    shutil.copy(HERE / "remote_operator.py", folder / "nobody_at_the_panel.py")
     (folder / "nobody_at_the_panel.py").chmod(0o755)
     limits = {"speed": speed_mm_s, "acceleration": acceleration_mm_s2}
     ini = MACHINE.format(folder=folder, axes=axes, joints=len(axes), **limits)

@@ -221,5 +221,5 @@ async def test_overrides_and_holds_are_reported_and_their_rapids_refused(tmp_pat
     accepted = [o.window.nc for o in outcomes if o.verdict.accepted]
     assert {nc and (nc.override, nc.held) for nc in accepted} == {((1.0, 1.0), False)}, texts
     assert len(accepted) >= 4, [(o.window.start_tick, o.window.nc, str(o.verdict.reasons)) for o in outcomes]
-    assert [t for t in texts if "override was 90 % in line" in t and t.startswith("EpisodeAborted")], texts
-    assert [t for t in texts if "feed was held in line 2" in t], texts
+    assert [t for t in texts if "an override of 90 % in line" in t and t.startswith("EpisodeAborted")], texts
+    assert [t for t in texts if "a feed hold in line 2" in t], texts

@@ -120,7 +120,7 @@ def guard_trees() -> dict[str, ast.Module]:
 
 
 def test_mode_changes_only_by_the_transition_table() -> None:
-    """No call but the one in ``State.after`` gives a state another mode; the shadow's copy is never sent."""
+    """No call but the one in ``GuardState.follow_event`` gives a state another mode; the shadow's copy is never sent."""
     found = [
         (name, ast.unparse(keyword.value))
         for name, tree in guard_trees().items()
@@ -131,8 +131,8 @@ def test_mode_changes_only_by_the_transition_table() -> None:
     ]
     others = sorted({(name, value) for name, value in found if name != Path(feedforward_law.__file__).name})
     assert others == [
-        (Path(shadow_correction.__file__).name, "Mode.ARMED"),
         (Path(guard_state.__file__).name, "NEXT[self.mode, event]"),
+        (Path(shadow_correction.__file__).name, "Mode.ARMED"),
     ]
 
 
@@ -143,7 +143,7 @@ def test_arm_and_adopt_events_occur_in_one_function_each() -> None:
         for function in ast.walk(tree)
         if isinstance(function, ast.FunctionDef)
         for call in ast.walk(function)
-        if isinstance(call, ast.Call) and ast.unparse(call.func).endswith(".after")
+        if isinstance(call, ast.Call) and ast.unparse(call.func).endswith(".follow_event")
         for event in [ast.unparse(call.args[0])]
         if event in ("Event.ARM", "Event.ADOPT") and name != Path(feedforward_law.__file__).name
     ]

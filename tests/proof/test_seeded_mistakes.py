@@ -45,7 +45,7 @@ MISTAKES: tuple[tuple[Callable[..., Any], str, str, Theorem], ...] = (
     (guard_step._note_sent_offset, "move = offset - axis.offset", "move = axis.offset - offset", PASSED_ON),
     (guard_step._note_sent_offset, "offset=offset", "offset=axis.offset", PASSED_ON),
     (guard_step._move_offsets, f"state = {guard_step._finish_ramps.__name__}(",
-     f"return state, Output()\n    state = {guard_step._finish_ramps.__name__}(", LEFT_BEHIND),
+     f"return state, StepOutput()\n    state = {guard_step._finish_ramps.__name__}(", LEFT_BEHIND),
 )  # fmt: skip
 
 

@@ -51,17 +51,17 @@ with raw_socket() as raw, open(file, "rb") as shared, mmap.mmap(shared.fileno(),
 
 READER = """
 import sys, time
-from fdhil.config import ListeningBus as BusSettings
+from fdhil.config import CanBus as BusSettings
 from fdhil.drivers.can.bus_listener import ListeningBus
 with ListeningBus("can0", BusSettings(interface="socketcan", channel="vcan0")) as bus:
     print("ready", flush=True)
     sys.stdin.readline()
     last, got = -1, 0
     while True:
-        frames = bus.drain()
+        frames = bus.drain_frames()
         numbers = frames["data"].astype("int64")
         got += numbers.size
-        counted = bus.counters()
+        counted = bus.read_counters()
         print(counted["frames"], counted["ring_overflow"], counted["kernel_drops"], got, flush=True)
         time.sleep(0.1)
 """
@@ -204,7 +204,7 @@ async def test_reception_resumes_after_the_interface_returns(tmp_path: Path) -> 
             await asyncio.sleep(0.2)
             set_up("vcan0", True)
             await until(lambda: result.count("Bus can0 is back.") == turn + 1)  # noqa: B023
-            assert sum("is tried again" in text for text in result) == turn + 1
+            assert sum("is retried" in text for text in result) == turn + 1
     finally:
         set_up("vcan0", True)
         running.cancel()
