@@ -1,12 +1,12 @@
+from .eds_file import INTEGER_TYPES as INTEGER_TYPES
+from .eds_file import EdsEntry as EdsEntry
+from .eds_file import EdsFile as EdsFile
+from .eds_file import EdsObject as EdsObject
 from .eds_numbers import read_expression as read_expression
 from .eds_numbers import read_number as read_number
 from .eds_numbers import read_octal as read_octal
-from .eds_reader import INTEGER_TYPES as INTEGER_TYPES
 from .eds_reader import MAX_BYTES as MAX_BYTES
 from .eds_reader import MAX_OBJECTS as MAX_OBJECTS
 from .eds_reader import MAX_SECTIONS as MAX_SECTIONS
-from .eds_reader import EdsEntry as EdsEntry
-from .eds_reader import EdsFile as EdsFile
-from .eds_reader import EdsObject as EdsObject
 from .eds_reader import parse_eds as parse_eds
 from .eds_reader import read_eds as read_eds

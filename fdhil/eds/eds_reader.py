@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fdhil.eds.compact_storage import expand_compact_storage, is_value_list
+from fdhil.eds.eds_file import INTEGER_TYPES, EdsEntry, EdsFile, EdsObject
 from fdhil.eds.eds_numbers import read_expression, read_number, read_octal
-from fdhil.eds.eds_reader import INTEGER_TYPES, EdsEntry, EdsFile, EdsObject
 from fdhil.errors import EdsError
 
 MAX_BYTES = 2 * 1024 * 1024

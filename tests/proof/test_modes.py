@@ -120,7 +120,7 @@ def guard_trees() -> dict[str, ast.Module]:
 
 
 def test_mode_changes_only_by_the_transition_table() -> None:
-    """No call but the one in ``GuardState.follow_event`` gives a state another mode; the shadow's copy is never sent."""
+    """No call but the one in ``follow_event`` gives a state another mode; the copy of the shadow is never sent."""
     found = [
         (name, ast.unparse(keyword.value))
         for name, tree in guard_trees().items()
