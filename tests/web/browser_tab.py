@@ -111,6 +111,9 @@ class BrowserTab:
         return set(self.page.evaluate(LABELS))
 
     def find_violations(self, *rules: str) -> list[str]:
+        self.page.evaluate(
+            "window.scrollTo(0, 0)"
+        )  # where the page is scrolled, its sticky header hides parts of targets
         self.page.evaluate(AXE.read_text("utf-8"))
         only = {"type": "rule", "values": rules} if rules else {"type": "tag", "values": TAGS}
         options = json.dumps({"runOnly": only, "resultTypes": ["violations"]})
